@@ -1,0 +1,240 @@
+"""Pictures and videos of postures and hops, drawn with Pillow: no window, no graphics card.
+
+Bars are drawn as the natural cubic spline through their masses (a pinned rod has no moment at its ends) and turn from
+blue to red as they bow; cables are green while taut and pale while slack; actuated cables are orange.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from PIL import Image
+
+from tensegrity_gym.canvas import TRAIL, Camera, Canvas
+from tensegrity_gym.design import Design
+from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
+from tensegrity_gym.lattice import Lattice
+from tensegrity_gym.scene import Scene
+from tensegrity_gym.simulate import Trajectory, simulate
+from tensegrity_gym.types import Floats, Structure
+
+#: A lattice whose lowest mass is above this is off the ground [m].
+ALOFT = 1e-3
+
+
+def draw_posture(
+    positions: ArrayLike,
+    *,
+    lattice: Lattice | None = None,
+    design: Design | None = None,
+    camera: Camera | None = None,
+    size: tuple[int, int] = (960, 720),
+    actuator_length: ArrayLike | None = None,
+    target: ArrayLike | None = None,
+    caption: str | None = None,
+) -> np.ndarray:
+    """Draw one posture, positions of shape (n_masses, 3) [m]; returns a picture of shape (h, w, 3), uint8.
+
+    ``actuator_length`` [m], shape (n_actuators,), are the actuated cables' rest lengths (default: unlocked).
+    """
+    structure = _structure(lattice or Lattice(2, 2), design or Design())
+    points = check_positions(positions, structure, 2)
+    canvas = Canvas(size, camera or Camera())
+    canvas.ground()
+    if target is not None:
+        canvas.target(target)
+    canvas.shadow(points, structure)
+    canvas.lattice(points, structure, None if actuator_length is None else np.asarray(actuator_length, dtype=float))
+    if caption:
+        canvas.text((0.5, 0.93), caption, height=max(size[1] // 30, 10))
+    return canvas.array()
+
+
+def filmstrip(
+    trajectory: Trajectory,
+    *,
+    hop: int = 0,
+    moments: int = 8,
+    lattice: Lattice | None = None,
+    design: Design | None = None,
+    size: tuple[int, int] = (2000, 560),
+    target: ArrayLike | None = None,
+) -> np.ndarray:
+    """One wide picture of a hop: ``moments`` postures side by side, with the path of the centre of mass between them.
+
+    ``hop`` picks one out of the trajectory's batch. Postures are moved apart to the right; nothing else is changed.
+    Returns shape (h, w, 3), uint8.
+    """
+    structure = _structure(lattice or Lattice(2, 2), design or Design())
+    frames = int(trajectory.frames[hop])
+    times = np.asarray(trajectory.times[hop][:frames], dtype=float)
+    points = check_positions(trajectory.positions[hop][:frames], structure, 3)
+    if moments < 1:
+        raise InvalidParameterError(f"filmstrip: moments: expected at least 1, got {moments}")
+    named = choose_moments(times, points, moments)
+    shown = np.array(sorted(named))
+    com = _centre_of_mass(points, structure)
+
+    top = float(points[..., 2].max())
+    camera = Camera(azimuth=np.radians(-75.0), distance=np.inf)
+    width = max(1.32 * len(shown) + 0.5, (top + 1.25) * size[0] / size[1])
+    camera = replace(camera, width=width, centre=(0.0, 0.0, (top - 0.3) / 2))
+    right = camera.axes[0]
+    columns = ((np.arange(len(shown)) + 0.5) / len(shown) - 0.5) * (width - 0.5)
+    offsets = columns[:, None] * right - com[0] * (1, 1, 0)
+
+    canvas = Canvas(size, camera)
+    canvas.ground()
+    if target is not None:
+        canvas.target(np.append(target, 0.0) + offsets[-1])
+    for frame, offset in zip(shown, offsets, strict=True):
+        canvas.shadow(points[frame] + offset, structure)
+    moved = np.column_stack([np.interp(times, times[shown], offsets[:, k]) for k in range(3)])
+    canvas.trail((com + moved)[shown[0] : shown[-1] + 1])
+    for k, (frame, offset) in enumerate(zip(shown, offsets, strict=True)):
+        canvas.lattice(points[frame] + offset, structure, _held_lengths(points[0], structure) if frame == 0 else None)
+        across = 0.5 + columns[k] / width
+        canvas.text((across, 0.875), f"{times[frame]:.2f} s", height=max(size[1] // 24, 9))
+        canvas.text((across, 0.93), named[frame], height=max(size[1] // 30, 8), colour=TRAIL)
+    return canvas.array()
+
+
+def choose_moments(times: Floats, positions: Floats, moments: int) -> dict[int, str]:
+    """The frames that tell a hop, at most ``moments`` of them, each with the name of its moment or "".
+
+    Shapes (f,) [s] and (f, n_masses, 3) [m]. A hop that never leaves the ground is divided evenly.
+    """
+    last = len(times) - 1
+    clearance = positions[..., 2].min(axis=1)
+    aloft = np.flatnonzero(clearance > ALOFT)
+    if len(aloft) < 2 or moments < 4:
+        return {int(frame): f"{'release' if frame == 0 else ''}" for frame in np.linspace(0, last, moments).astype(int)}
+    apex = int(np.argmax(positions[..., 2].mean(axis=1)))
+    takeoff = int(aloft[0])
+    grounded = np.flatnonzero(clearance[apex:] <= ALOFT)
+    touchdown = apex + int(grounded[0]) if len(grounded) else last
+    settling = int(np.searchsorted(times, times[touchdown] + 0.12 * (times[last] - times[touchdown])))
+    # most telling first: where there is room for fewer, the rest is left out
+    wanted = [(0, "release"), (last, "end"), (apex, "apex"), (touchdown, "touchdown"), (takeoff, "take-off")]
+    wanted += [((takeoff + apex) // 2, ""), ((apex + touchdown) // 2, ""), (settling, "")]
+    wanted += [(int(frame), "") for frame in np.linspace(settling, last, max(moments - 6, 2))[1:-1]]
+    chosen: dict[int, str] = {}
+    for frame, name in wanted:
+        if len(chosen) < moments:
+            chosen.setdefault(frame, name)
+    return chosen
+
+
+def record_hop(
+    stretches: ArrayLike,
+    path: str | Path,
+    *,
+    scene: Scene | None = None,
+    design: Design | None = None,
+    lattice: Lattice | None = None,
+    target: ArrayLike | None = None,
+    fps: int = 30,
+    speed: float = 0.5,
+    size: tuple[int, int] = (640, 640),
+) -> Path:
+    """Simulate one hop and write it as ``.gif`` or ``.mp4`` (which needs the extra "video"); returns the path.
+
+    ``speed`` is film time over real time [-]. The camera holds the whole hop in view.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise InvalidParameterError(f"record_hop: expected a path that ends in .gif or .mp4, got {str(path)!r}")
+    if not fps > 0 or not speed > 0:
+        raise InvalidParameterError(f"record_hop: expected fps > 0 and speed > 0, got {fps!r} and {speed!r}")
+    scene, design, lattice = scene or Scene(), design or Design(), lattice or Lattice(2, 2)
+    one = np.atleast_2d(np.asarray(stretches, dtype=float))[:1]
+    hop = simulate(one, scene=scene, design=design, lattice=lattice, trajectory_rate=fps / speed)
+    assert hop.trajectory is not None  # it was asked for
+    frames = int(hop.trajectory.frames[0])
+    points, times = hop.trajectory.positions[0][:frames], hop.trajectory.times[0][:frames]
+    camera = watching_camera(points, size)
+    pictures = []
+    for k in range(frames):
+        held = one[0] * design.cell_height if k == 0 else None
+        caption = f"{times[k]:.2f} s"
+        pictures.append(
+            draw_posture(
+                points[k],
+                lattice=lattice,
+                design=design,
+                camera=camera,
+                size=size,
+                actuator_length=held,
+                target=target,
+                caption=caption,
+            )
+        )
+    _write_video(pictures, path, fps)
+    return path
+
+
+def watching_camera(positions: Floats, size: tuple[int, int]) -> Camera:
+    """A camera that has all of a hop in view, positions of shape (f, n_masses, 3) [m]."""
+    points = positions.reshape(-1, 3)
+    camera = Camera()
+    seen = points @ camera.axes.T
+    spread = np.ptp(seen[:, :2], axis=0)
+    width = 1.25 * max(spread[0], spread[1] * size[0] / size[1]) + 0.3
+    middle = camera.axes.T @ ((seen.max(axis=0) + seen.min(axis=0)) / 2)
+    return replace(camera, centre=tuple(float(c) for c in middle), width=float(width), distance=4 * float(width))
+
+
+def waiting_picture(lattice: Lattice, *, target: ArrayLike | None = None, size: tuple[int, int] = (2000, 560)) -> np.ndarray:
+    """The unloaded lattice standing on the ground, and the target: what there is to see before a hop; (h, w, 3) uint8."""
+    points = Design().unloaded_positions(lattice)
+    points[:, 2] -= points[:, 2].min()
+    return draw_posture(points, lattice=lattice, camera=Camera(width=4.0), size=size, target=target)
+
+
+def check_positions(positions: ArrayLike, structure: Structure, dimensions: int) -> Floats:
+    """Positions as float64; InvalidParameterError if their shape isn't that of the structure, or one isn't finite."""
+    points = np.asarray(positions, dtype=np.float64)
+    shape = (len(structure.mass), 3)
+    if points.ndim != dimensions or points.shape[-2:] != shape or points.shape[0] == 0:
+        expected = shape if dimensions == 2 else ("frames", *shape)
+        raise InvalidParameterError(f"positions: expected shape {expected} for this lattice and design, got {points.shape}")
+    if not np.isfinite(points).all():
+        raise InvalidParameterError("positions: expected finite numbers [m], got some that are not")
+    return points
+
+
+@lru_cache(maxsize=8)
+def _structure(lattice: Lattice, design: Design) -> Structure:
+    return design.structure(lattice)
+
+
+def _centre_of_mass(points: Floats, structure: Structure) -> Floats:
+    return np.einsum("m,fmk->fk", structure.mass / structure.mass.sum(), points)
+
+
+def _held_lengths(positions: Floats, structure: Structure) -> Floats:
+    """Rest lengths with which every actuated cable counts as taut: what it was held at before release [m]."""
+    lower, upper = structure.actuators.T
+    return 0.99 * np.linalg.norm(positions[upper] - positions[lower], axis=1)
+
+
+def _write_video(pictures: list[np.ndarray], path: Path, fps: int) -> None:
+    if path.suffix.lower() == ".gif":
+        # one palette for all frames: the colours are few and must not flicker
+        first = Image.fromarray(pictures[len(pictures) // 2]).quantize(128)
+        frames = [Image.fromarray(p).quantize(palette=first, dither=Image.Dither.NONE) for p in pictures]
+        frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False)
+        return
+    try:
+        import imageio.v2 as imageio
+    except ImportError:
+        raise MissingExtraError(
+            "record_hop: .mp4 needs imageio and imageio-ffmpeg: pip install 'tensegrity-gym[video]', or write a .gif"
+        ) from None
+    with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
+        for picture in pictures:
+            writer.append_data(picture)
