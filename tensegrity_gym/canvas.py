@@ -71,46 +71,15 @@ class Canvas:
         self.size = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
         self.camera = camera
         self.pixels_per_metre = self.size[0] / camera.width
-        self.image = Image.fromarray(_sky(self.size))
+        self.image = _background(self.size, camera).copy()
         self.draw = ImageDraw.Draw(self.image)
 
-    def project(self, points: Floats) -> tuple[list[tuple[float, float]], Floats]:
-        pixels, near = self.camera.project(points, self.size)
-        return [(float(x), float(y)) for x, y in pixels.reshape(-1, 2)], near
+    def project(self, points: Floats) -> list[tuple[float, float]]:
+        """Pixels of points, shape (n, 3) [m]."""
+        return _corners(self.camera.project(points, self.size)[0])
 
     def line_width(self, metres: float) -> int:
         return max(round(metres * self.pixels_per_metre), SUPERSAMPLING)
-
-    def ground(self, spacing: float = 0.5) -> None:
-        """A strip of ground across the picture with a grid of squares of ``spacing`` [m]."""
-        right, _, towards = self.camera.axes
-        back = -np.array((towards[0], towards[1], 0.0)) / np.hypot(*towards[:2])
-        middle = np.array((*self.camera.centre[:2], 0.0))
-        parallel = not np.isfinite(self.camera.distance)
-        half = self.camera.width * (0.6 if parallel else 2.0)
-        # far enough towards the camera to fill the picture down to its lower edge
-        below = self.camera.width * self.size[1] / self.size[0] / 2 + self.camera.centre[2]
-        deep = below / max(float(towards[2]), 0.05) + 0.5
-        front = -(deep if parallel else min(deep, 0.85 * self.camera.distance))
-        rear = 2.0 if parallel else max(2.0, 0.9 * self.camera.width)
-        corners = [middle + s * half * right + d * back for s, d in ((-1, front), (1, front), (1, rear), (-1, rear))]
-        mask = Image.new("L", self.size)
-        ImageDraw.Draw(mask).polygon(self.project(np.array(corners))[0], fill=255)
-        lines = Image.new("RGB", self.size, SAND)
-        pen = ImageDraw.Draw(lines)
-        span = half + max(-front, rear)
-        for k in range(int(np.floor(-span / spacing)), int(np.ceil(span / spacing)) + 1):
-            x, y = (np.round(middle[:2] / spacing) + k) * spacing
-            for ends in (
-                ((x, middle[1] - span, 0), (x, middle[1] + span, 0)),
-                ((middle[0] - span, y, 0), (middle[0] + span, y, 0)),
-            ):
-                pen.line(self.project(np.array(ends, dtype=float))[0], fill=GRID, width=SUPERSAMPLING)
-        top = min(y for _, y in self.project(np.array(corners))[0])
-        # the far edge fades into the sky
-        rows = np.clip((np.arange(self.size[1]) - top) / (0.09 * self.size[1]), 0, 1)
-        fade = Image.fromarray(np.repeat((255 * rows).astype(np.uint8)[:, None], self.size[0], axis=1))
-        self.image.paste(lines, mask=Image.composite(fade, Image.new("L", self.size), mask))
 
     def shadow(self, positions: Floats, structure: Structure) -> None:
         """The bars' shadow on the ground, softer the higher the lattice is."""
@@ -122,36 +91,37 @@ class Canvas:
         mask = Image.new("L", self.size)
         pen = ImageDraw.Draw(mask)
         for curve in pixels:
-            pen.line([(float(x), float(y)) for x, y in curve], fill=105, width=self.line_width(2.2 * BAR_WIDTH), joint="curve")
+            pen.line(_corners(curve), fill=105, width=self.line_width(2.2 * BAR_WIDTH), joint="curve")
         height = max(float(positions[:, 2].min()), 0.0)
         blur = (0.012 + 0.02 * min(height, 1.5)) * self.pixels_per_metre
         self.image.paste((92, 84, 76), mask=mask.filter(ImageFilter.BoxBlur(blur)))
 
     def lattice(self, positions: Floats, structure: Structure, actuator_length: Floats | None = None) -> None:
         """Members and nodes, the far ones first and paler."""
-        curves = bar_curves(positions, structure)
-        near = self.camera.project(positions, self.size)[1]
-        span = float(np.ptp(near)) or 1.0
-        items: list[tuple[float, list[tuple[float, float]], Colour, float]] = []
-        bow = np.minimum(bar_bow(positions, structure) / FULL_BOW, 1.0)
-        for curve, share, ends in zip(curves, bow, structure.bars, strict=True):
-            items.append((near[ends].mean(), self.project(curve)[0], _mix(STRAIGHT, BOWED, float(share)), BAR_WIDTH))
-        for ends, taut in zip(structure.cables, _taut(positions, structure.cables, structure.cable_length), strict=True):
-            items.append((near[ends].mean(), self.project(positions[ends])[0], TAUT if taut else SLACK, CABLE_WIDTH))
+        pixels, near = self.camera.project(positions, self.size)
+        curves = self.camera.project(bar_curves(positions, structure), self.size)[0]
+        paleness = 0.62 * (near.max() - near) / (float(np.ptp(near)) or 1.0)
         rest = structure.actuator_length if actuator_length is None else actuator_length
-        for ends, taut in zip(structure.actuators, _taut(positions, structure.actuators, rest), strict=True):
-            width = ACTUATOR_WIDTH if taut else CABLE_WIDTH
-            items.append((near[ends].mean(), self.project(positions[ends])[0], ACTUATOR, width))
-        nearest = float(near.max())
-        for depth, points, colour, metres in sorted(items, key=lambda item: item[0]):
-            paler = _mix(colour, HORIZON, 0.62 * float(np.clip((nearest - depth) / span, 0, 1)))
-            self.draw.line(points, fill=paler, width=self.line_width(metres), joint="curve")
+        items: list[tuple[float, Floats, Colour, float]] = []
+        bow = np.minimum(bar_bow(positions, structure) / FULL_BOW, 1.0)
+        for curve, share, pale in zip(curves, bow, paleness[structure.bars].mean(axis=1), strict=True):
+            items.append((pale, curve, _mix(STRAIGHT, BOWED, share), BAR_WIDTH))
+        for members, natural, colours, widths in (
+            (structure.cables, structure.cable_length, (SLACK, TAUT), (CABLE_WIDTH, CABLE_WIDTH)),
+            (structure.actuators, rest, (ACTUATOR, ACTUATOR), (CABLE_WIDTH, ACTUATOR_WIDTH)),
+        ):
+            taut = _taut(positions, members, natural)
+            for ends, pale, tight in zip(pixels[members], paleness[members].mean(axis=1), taut, strict=True):
+                items.append((pale, ends, colours[int(tight)], widths[int(tight)]))
+        for pale, points, colour, metres in sorted(items, key=lambda item: -item[0]):
+            self.draw.line(
+                points.ravel().tolist(), fill=_mix(colour, HORIZON, pale), width=self.line_width(metres), joint="curve"
+            )
         nodes = np.unique(structure.bars[:, [0, -1]])
         r = NODE_RADIUS * self.pixels_per_metre
         for node in nodes[np.argsort(near[nodes])]:
-            (x, y) = self.project(positions[node])[0][0]
-            paler = _mix(NODE, HORIZON, 0.62 * float(np.clip((nearest - near[node]) / span, 0, 1)))
-            self.draw.ellipse((x - r, y - r, x + r, y + r), fill=paler)
+            x, y = pixels[node]
+            self.draw.ellipse((x - r, y - r, x + r, y + r), fill=_mix(NODE, HORIZON, paleness[node]))
 
     def target(self, point: ArrayLike) -> None:
         """Rings on the ground around the target, of 4 and 8 cm radius."""
@@ -159,7 +129,7 @@ class Canvas:
         middle = np.array((*np.asarray(point, dtype=float)[:2], 0.0))
         for radius in (0.04, 0.08):
             ring = middle + radius * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-            self.draw.line(self.project(ring)[0], fill=TARGET, width=self.line_width(0.01), joint="curve")
+            self.draw.line(self.project(ring), fill=TARGET, width=self.line_width(0.01), joint="curve")
 
     def trail(self, path: Floats, dot: float = 0.009, every: float = 0.06) -> None:
         """Dots ``every`` metres along a path, shape (n, 3) [m]."""
@@ -167,7 +137,7 @@ class Canvas:
         at = np.arange(0.0, along[-1], every)
         dots = np.column_stack([np.interp(at, along, path[:, k]) for k in range(3)])
         r = dot * self.pixels_per_metre
-        for x, y in self.project(dots)[0]:
+        for x, y in self.project(dots):
             self.draw.ellipse((x - r, y - r, x + r, y + r), fill=TRAIL)
 
     def text(self, where: tuple[float, float], words: str, height: int, colour: Colour = INK, anchor: str = "ma") -> None:
@@ -219,10 +189,48 @@ def _mix(a: Colour, b: Colour, share: float) -> Colour:
 
 
 @lru_cache(maxsize=4)
-def _sky(size: tuple[int, int]) -> np.ndarray:
+def _background(size: tuple[int, int], camera: Camera, spacing: float = 0.5) -> Image.Image:
+    """Sky, and a strip of ground across the picture with a grid of squares of ``spacing`` [m]."""
     down = np.linspace(0, 1, size[1])[:, None, None]
     column = np.array(SKY) + np.minimum(1.4 * down, 1.0) * (np.array(HORIZON) - np.array(SKY))
-    return np.broadcast_to(column, (size[1], size[0], 3)).astype(np.uint8)
+    picture = Image.fromarray(np.broadcast_to(column, (size[1], size[0], 3)).astype(np.uint8))
+
+    strip = _ground_strip(size, camera)
+    outline = _corners(camera.project(strip, size)[0])
+    mask = Image.new("L", size)
+    ImageDraw.Draw(mask).polygon(outline, fill=255)
+    ground = Image.new("RGB", size, SAND)
+    pen = ImageDraw.Draw(ground)
+    middle = np.array(camera.centre[:2])
+    span = float(np.linalg.norm(strip[:, :2] - middle, axis=1).max())
+    for k in range(-int(np.ceil(span / spacing)), int(np.ceil(span / spacing)) + 1):
+        x, y = (np.round(middle / spacing) + k) * spacing
+        for ends in (((x, middle[1] - span, 0), (x, middle[1] + span, 0)), ((middle[0] - span, y, 0), (middle[0] + span, y, 0))):
+            pen.line(_corners(camera.project(np.array(ends, dtype=float), size)[0]), fill=GRID, width=SUPERSAMPLING)
+    # the far edge fades into the sky
+    top = min(y for _, y in outline)
+    rows = np.clip((np.arange(size[1]) - top) / (0.09 * size[1]), 0, 1)
+    fade = Image.fromarray(np.repeat((255 * rows).astype(np.uint8)[:, None], size[0], axis=1))
+    picture.paste(ground, mask=Image.composite(fade, Image.new("L", size), mask))
+    return picture
+
+
+def _ground_strip(size: tuple[int, int], camera: Camera) -> Floats:
+    """Corners of the ground that is drawn, shape (4, 3) [m]: wider than the picture, and down to its lower edge."""
+    right, _, towards = camera.axes
+    back = -np.array((towards[0], towards[1], 0.0)) / np.hypot(*towards[:2])
+    middle = np.array((*camera.centre[:2], 0.0))
+    parallel = not np.isfinite(camera.distance)
+    half = camera.width * (0.6 if parallel else 2.0)
+    below = camera.width * size[1] / size[0] / 2 + camera.centre[2]
+    deep = below / max(float(towards[2]), 0.05) + 0.5
+    front = -(deep if parallel else min(deep, 0.85 * camera.distance))
+    rear = 2.0 if parallel else max(2.0, 0.9 * camera.width)
+    return np.array([middle + s * half * right + d * back for s, d in ((-1, front), (1, front), (1, rear), (-1, rear))])
+
+
+def _corners(pixels: Floats) -> list[tuple[float, float]]:
+    return [(float(x), float(y)) for x, y in pixels]
 
 
 @lru_cache(maxsize=8)

@@ -23,8 +23,8 @@ RENDER_RATE = 120.0
 class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
     """Choose the four stretches that make the 2x2 lattice land on the target.
 
-    Observation: Box float32, target x, y [m] relative to the start; if the scene is randomised, then also gravity
-    [m/s^2], friction [-] and slope [rad]: shape (2,) or (5,). Action: Box(0.2, 0.8, (4,), float32), the stretches [-].
+    Observation: Box float32, target x, y [m] relative to the start, then those of gravity [m/s^2],
+    friction [-] and slope [rad] that are randomised: shape (2,) to (5,). Action: Box(0.2, 0.8, (4,), float32), the stretches [-].
     Reward: minus the landing error over the scene's reach [-], at least ``task.WORST_REWARD``, which failed hops get.
     The first step terminates. Its info: ``landing``, ``touchdown`` (2,) [m], ``error`` [m], ``success``, ``apex`` [m],
     ``energies`` (4, 7) [J], ``status``, ``simulator_calls`` (hops that this step simulated).
@@ -61,7 +61,9 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
         low, high = task.observation_bounds(self.scenes)
         self.observation_space = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         self.action_space = spaces.Box(STRETCH_RANGE[0], STRETCH_RANGE[1], shape=(self.lattice.n_cells,), dtype=np.float32)
-        self._scene: Scene | None = None  # None: no episode is running
+        #: Scene of the running or last episode; None before the first reset.
+        self.scene: Scene | None = None
+        self._running = False
         self._target = np.zeros(2)
         self._hop: HopResult | None = None
 
@@ -80,22 +82,22 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
             target = task.check_target(options["target"], scene)
         else:
             target = task.sample_targets(self.np_random, 1, scene)[0]
-        observation = task.observe(target, scene, bool(self.scenes.ranges))
+        observation = task.observe(target, scene, self.scenes.observed)
         # what is scored is what was observed: the target as float32
         self._target = observation[:2].astype(np.float64)
-        self._scene, self._hop = scene, None
+        self.scene, self._running, self._hop = scene, True, None
         return observation, {"target": self._target.copy(), "reach": task.reach(scene)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hop with stretches ``action``, shape (4,); terminates."""
-        if self._scene is None:
+        scene = self.scene
+        if scene is None or not self._running:
             raise ResetNeededError("step: expected a running episode, got none; call reset() first, one hop ends an episode")
         stretches = check_action(action, self.action_space.shape or ())
         rate = RENDER_RATE if self.render_mode else None
-        scene = self._scene
         self._hop = hop = simulate(stretches, scene=scene, lattice=self.lattice, trajectory_rate=rate)
         self.simulator_calls += 1
-        self._scene = None
+        self._running = False
         reach = task.reach(scene)
         scored = (hop.landing, self._target[None], hop.status)
         info = {
@@ -108,7 +110,7 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
             "status": HopStatus(int(hop.status[0])),
             "simulator_calls": 1,
         }
-        observation = task.observe(self._target, scene, bool(self.scenes.ranges))
+        observation = task.observe(self._target, scene, self.scenes.observed)
         return observation, float(task.reward(*scored, reach)[0]), True, False, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

@@ -39,12 +39,11 @@ def draw_posture(
 ) -> np.ndarray:
     """Draw one posture, positions of shape (n_masses, 3) [m]; returns a picture of shape (h, w, 3), uint8.
 
-    ``actuator_length`` [m], shape (n_actuators,), are the actuated cables' rest lengths (default: unlocked).
+    ``target`` [m], shape (2,), is a point on the ground. ``actuator_length`` [m], shape (n_actuators,), are the actuated cables' rest lengths (default: unlocked).
     """
     structure = _structure(lattice or Lattice(2, 2), design or Design())
     points = check_positions(positions, structure, 2)
     canvas = Canvas(size, camera or Camera())
-    canvas.ground()
     if target is not None:
         canvas.target(target)
     canvas.shadow(points, structure)
@@ -66,7 +65,7 @@ def filmstrip(
 ) -> np.ndarray:
     """One wide picture of a hop: ``moments`` postures side by side, with the path of the centre of mass between them.
 
-    ``hop`` picks one out of the trajectory's batch. Postures are moved apart to the right; nothing else is changed.
+    ``hop`` picks one out of the trajectory's batch; ``target`` [m], shape (2,), is relative to the start. Postures are moved apart to the right; nothing else is changed.
     Returns shape (h, w, 3), uint8.
     """
     structure = _structure(lattice or Lattice(2, 2), design or Design())
@@ -88,7 +87,6 @@ def filmstrip(
     offsets = columns[:, None] * right - com[0] * (1, 1, 0)
 
     canvas = Canvas(size, camera)
-    canvas.ground()
     if target is not None:
         canvas.target(np.append(target, 0.0) + offsets[-1])
     for frame, offset in zip(shown, offsets, strict=True):
@@ -143,7 +141,7 @@ def record_hop(
 ) -> Path:
     """Simulate one hop and write it as ``.gif`` or ``.mp4`` (which needs the extra "video"); returns the path.
 
-    ``speed`` is film time over real time [-]. The camera holds the whole hop in view.
+    ``speed`` is real time over film time [-]: 0.5 is slow motion. ``target`` [m] is relative to the start. The camera holds the whole hop in view.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
@@ -157,6 +155,8 @@ def record_hop(
     frames = int(hop.trajectory.frames[0])
     points, times = hop.trajectory.positions[0][:frames], hop.trajectory.times[0][:frames]
     camera = watching_camera(points, size)
+    if target is not None:  # targets are relative to where the centre of mass started
+        target = np.asarray(target, dtype=float) + _centre_of_mass(points[:1], _structure(lattice, design))[0, :2]
     pictures = []
     for k in range(frames):
         held = one[0] * design.cell_height if k == 0 else None
@@ -185,7 +185,8 @@ def watching_camera(positions: Floats, size: tuple[int, int]) -> Camera:
     spread = np.ptp(seen[:, :2], axis=0)
     width = 1.25 * max(spread[0], spread[1] * size[0] / size[1]) + 0.3
     middle = camera.axes.T @ ((seen.max(axis=0) + seen.min(axis=0)) / 2)
-    return replace(camera, centre=tuple(float(c) for c in middle), width=float(width), distance=4 * float(width))
+    x, y, z = (float(c) for c in middle)
+    return replace(camera, centre=(x, y, z), width=float(width), distance=4 * float(width))
 
 
 def waiting_picture(lattice: Lattice, *, target: ArrayLike | None = None, size: tuple[int, int] = (2000, 560)) -> np.ndarray:
@@ -230,11 +231,14 @@ def _write_video(pictures: list[np.ndarray], path: Path, fps: int) -> None:
         frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False)
         return
     try:
-        import imageio.v2 as imageio
+        import imageio_ffmpeg
     except ImportError:
         raise MissingExtraError(
-            "record_hop: .mp4 needs imageio and imageio-ffmpeg: pip install 'tensegrity-gym[video]', or write a .gif"
+            "record_hop: .mp4 needs imageio-ffmpeg: pip install 'tensegrity-gym[video]', or write a .gif"
         ) from None
-    with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
-        for picture in pictures:
-            writer.append_data(picture)
+    height, width = pictures[0].shape[:2]
+    writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=fps, macro_block_size=2, quality=8)
+    writer.send(None)
+    for picture in pictures:
+        writer.send(np.ascontiguousarray(picture))
+    writer.close()

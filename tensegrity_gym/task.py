@@ -6,7 +6,7 @@ was made.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -129,25 +129,27 @@ class SceneRanges:
                 raise InvalidParameterError(f"scene ranges: expected keys out of {SCENE_VALUES}, got {name!r}")
             _check_range(name, bounds)
             for bound in bounds:  # a bound that no scene can have is refused now, not at some later reset
-                replace(self.base, **{name: float(bound)})
+                self._with({name: bound})
 
     @property
-    def corners(self) -> list[Scene]:
-        """The scenes in which all randomised values are at their low, or at their high ends."""
-        return [replace(self.base, **{k: float(v[end]) for k, v in self.ranges.items()}) for end in (0, 1)]
+    def observed(self) -> tuple[str, ...]:
+        """Names of the randomised values in the order in which they are observed."""
+        return tuple(name for name in SCENE_VALUES if name in self.ranges)
 
     def bounds(self) -> tuple[Floats, Floats]:
-        """Least and greatest observed scene values, shapes (0,) or (3,); empty where nothing is randomised."""
-        if not self.ranges:
-            return np.zeros(0), np.zeros(0)
-        low, high = (np.array([getattr(scene, name) for name in SCENE_VALUES]) for scene in self.corners)
-        return low, high
+        """Least and greatest of the randomised values, in observed order, shapes (k,)."""
+        pairs = np.array([self.ranges[name] for name in self.observed], dtype=np.float64).reshape(-1, 2)
+        return pairs[:, 0], pairs[:, 1]
 
     def sample(self, rng: np.random.Generator) -> Scene:
         """One scene."""
         if not self.ranges:
             return self.base
-        return replace(self.base, **{k: float(rng.uniform(*self.ranges[k])) for k in SCENE_VALUES if k in self.ranges})
+        return self._with({name: rng.uniform(*self.ranges[name]) for name in self.observed})
+
+    def _with(self, values: Mapping[str, float]) -> Scene:
+        changes: dict[str, Any] = {name: float(value) for name, value in values.items()}
+        return replace(self.base, **changes)
 
 
 def scene_ranges(scene: str | Scene | SceneRanges | Mapping[str, Any], landing: str | None = None) -> SceneRanges:
@@ -176,7 +178,7 @@ def scene_ranges(scene: str | Scene | SceneRanges | Mapping[str, Any], landing: 
 
 
 def observation_bounds(scenes: SceneRanges) -> tuple[Floats, Floats]:
-    """Least and greatest observation, shapes (2,) or (5,): target x, y [m], then gravity, friction, slope if randomised."""
+    """Least and greatest observation, shapes (2 + k,): target x, y [m], then what is randomised."""
     low, high = scenes.bounds()
     # reach changes by preset, not evenly between the corners: take the widest disc of any
     reaches = [r[scenes.base.landing] for r in REACHES.values()]
@@ -184,12 +186,10 @@ def observation_bounds(scenes: SceneRanges) -> tuple[Floats, Floats]:
     return np.concatenate([[-far, -far], low]), np.concatenate([[far, far], high])
 
 
-def observe(target: ArrayLike, scene: Scene, randomised: bool) -> np.ndarray:
-    """Observation of targets in one scene, shapes (n, 2) -> (n, 2) or, if the scene is randomised, (n, 5); float32."""
+def observe(target: ArrayLike, scene: Scene, names: Sequence[str] = ()) -> np.ndarray:
+    """Observation of targets in one scene, shapes (n, 2) -> (n, 2 + k), float32: target [m], then the values in ``names``."""
     target = np.asarray(target, dtype=np.float32)
-    if not randomised:
-        return target.copy()
-    values = np.array([getattr(scene, name) for name in SCENE_VALUES], dtype=np.float32)
+    values = np.array([getattr(scene, name) for name in names], dtype=np.float32)
     return np.concatenate([target, np.broadcast_to(values, (*target.shape[:-1], len(values)))], axis=-1)
 
 
@@ -214,5 +214,5 @@ def check_target(target: ArrayLike, scene: Scene) -> Floats:
 def _check_range(name: str, bounds: Any) -> None:
     if len(bounds) != 2 or not all(isinstance(b, (int, float, np.number)) and np.isfinite(b) for b in bounds):
         raise InvalidParameterError(f"scene ranges: {name}: expected (low, high), two finite numbers, got {bounds!r}")
-    if not bounds[0] <= bounds[1]:
-        raise InvalidParameterError(f"scene ranges: {name}: expected low <= high, got {bounds!r}")
+    if not bounds[0] < bounds[1]:
+        raise InvalidParameterError(f"scene ranges: {name}: expected low < high (a number fixes a value), got {bounds!r}")

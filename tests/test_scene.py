@@ -1,0 +1,73 @@
+"""Scenes: presets, the slope as tilted gravity, and values that no planet has."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tensegrity_gym.errors import InvalidParameterError, TensegrityError, UnknownPresetError
+from tensegrity_gym.scene import Scene
+
+
+@pytest.mark.parametrize("name", sorted(Scene.PRESETS))
+def test_presets_are_scenes(name: str) -> None:
+    scene = Scene.preset(name)
+    assert scene.gravity == Scene.PRESETS[name]["gravity"]
+    assert scene.ground.friction == scene.friction
+    assert np.linalg.norm(scene.gravity_vector) == pytest.approx(scene.gravity, rel=1e-15)
+
+
+def test_presets_can_be_changed_by_keyword() -> None:
+    scene = Scene.preset("moon", friction=0.3, landing="touchdown")
+    assert (scene.gravity, scene.friction, scene.landing) == (1.625, 0.3, "touchdown")
+
+
+def test_an_unknown_preset_names_those_there_are() -> None:
+    with pytest.raises(UnknownPresetError, match=r"expected one of \['earth', .*got 'pluto'") as caught:
+        Scene.preset("pluto")
+    assert isinstance(caught.value, TensegrityError)
+    assert isinstance(caught.value, KeyError)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 0.7, -2.0])
+def test_slope_tilts_gravity_downhill(azimuth: float) -> None:
+    """On a plane inclined by theta, g has g sin(theta) along the plane and -g cos(theta) along its normal."""
+    theta, g = 0.2, 3.7208
+    x, y, z = Scene(gravity=g, slope=theta, slope_direction=azimuth).gravity_vector
+    assert z == pytest.approx(-g * np.cos(theta), rel=1e-14)
+    assert np.hypot(x, y) == pytest.approx(g * np.sin(theta), rel=1e-14)
+    assert np.arctan2(y, x) == pytest.approx(azimuth, abs=1e-14)
+
+
+def test_flat_ground_has_vertical_gravity() -> None:
+    np.testing.assert_array_equal(Scene.preset("earth").gravity_vector, (0, 0, -9.80665))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("gravity", -1.0),
+        ("gravity", 0.0),
+        ("gravity", float("nan")),
+        ("gravity", "high"),
+        ("slope", 2.0),
+        ("slope", -0.1),
+        ("friction", -0.5),
+        ("friction", float("inf")),
+        ("restitution", 1.1),
+        ("duration", 0.0),
+        ("duration", True),
+        ("landing", "orbit"),
+    ],
+)
+def test_values_that_no_scene_has_are_refused_by_name(field: str, value: object) -> None:
+    with pytest.raises(InvalidParameterError, match=rf"Scene\.{field}.*expected.*got"):
+        Scene(**{field: value})  # type: ignore[arg-type]
+
+
+def test_scenes_are_frozen_and_hashable() -> None:
+    assert len({Scene(), Scene(), Scene.preset("earth")}) == 1
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Scene().gravity = 1.0  # type: ignore[misc]

@@ -1,0 +1,65 @@
+"""The set-up: what is public, what an import costs, what the command line says of mistakes."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import tensegrity_gym
+from tensegrity_gym.cli import main
+
+ROOT = Path(__file__).parent.parent
+HEAVY = ("torch", "matplotlib", "stable_baselines3", "tensorboard", "PIL.Image")
+PUBLIC = ("MODEL_VERSION", "Lattice", "Design", "Scene", "HopStatus", "ENERGY_NAMES", "STRETCH_RANGE", "form_find", "simulate")
+
+
+def test_import_is_light() -> None:
+    code = f"import sys, tensegrity_gym; print([m for m in {HEAVY!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_names_have_one_import_path(name: str) -> None:
+    assert hasattr(tensegrity_gym, name)
+
+
+def test_every_direct_dependency_is_pinned() -> None:
+    """An unpinned torch would be fetched with gigabytes of CUDA."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = list(project["dependencies"])
+    for extra in project["optional-dependencies"].values():
+        wanted += extra
+    names = {re.split(r"[<>=!~ \[]", requirement)[0].lower() for requirement in wanted}
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
+    assert names <= pinned
+
+
+def test_info_prints_the_lattice_and_the_design(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"point masses\s+184\n", printed)
+    assert re.search(r"Euler load\s+4[78]\.\d+ N", printed)
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["hop", "--scene", "pluto"], "UnknownPresetError: .*expected one of .*got 'pluto'"),
+        (["hop", "--stretches", "0.1", "0.3", "0.3", "0.3"], "InvalidStretchesError: .*expected.*got"),
+        (["hop", "--stretches", "nan", "0.3", "0.3", "0.3"], "InvalidStretchesError: .*expected.*got"),
+        (["hop", "--picture", "no/such/folder/hop.png"], "OutputFolderError: expected an existing folder"),
+        (["hop", "--picture", "hop.pdf"], "InvalidParameterError: --picture: expected a path that ends in"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(args) == 2
+    error = capsys.readouterr().err
+    assert re.match(said, error)
+    assert error.count("\n") == 1
