@@ -39,7 +39,8 @@ def draw_posture(
 ) -> np.ndarray:
     """Draw one posture, positions of shape (n_masses, 3) [m]; returns a picture of shape (h, w, 3), uint8.
 
-    ``target`` [m], shape (2,), is a point on the ground. ``actuator_length`` [m], shape (n_actuators,), are the actuated cables' rest lengths (default: unlocked).
+    ``target`` [m], shape (2,), is a point on the ground. ``actuator_length`` [m], shape (n_actuators,), are the actuated
+    cables' rest lengths (default: unlocked).
     """
     structure = _structure(lattice or Lattice(2, 2), design or Design())
     points = check_positions(positions, structure, 2)
@@ -65,7 +66,8 @@ def filmstrip(
 ) -> np.ndarray:
     """One wide picture of a hop: ``moments`` postures side by side, with the path of the centre of mass between them.
 
-    ``hop`` picks one out of the trajectory's batch; ``target`` [m], shape (2,), is relative to the start. Postures are moved apart to the right; nothing else is changed.
+    ``hop`` picks one out of the trajectory's batch; ``target`` [m], shape (2,), is relative to the start. Postures are
+    moved apart to the right; nothing else is changed.
     Returns shape (h, w, 3), uint8.
     """
     structure = _structure(lattice or Lattice(2, 2), design or Design())
@@ -141,7 +143,8 @@ def record_hop(
 ) -> Path:
     """Simulate one hop and write it as ``.gif`` or ``.mp4`` (which needs the extra "video"); returns the path.
 
-    ``speed`` is real time over film time [-]: 0.5 is slow motion. ``target`` [m] is relative to the start. The camera holds the whole hop in view.
+    ``speed`` is real time over film time [-]: 0.5 is slow motion. ``target`` [m] is relative to the start. The camera
+    holds the whole hop in view.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
