@@ -1,0 +1,93 @@
+"""The demo from end to end with few hops, its resume, and the errors that its user may meet."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from surrogate.model import NetConfig
+from surrogate.train import TrainConfig
+from tensegrity_gym.errors import DataFileError, InvalidParameterError, OutputFolderError
+from training import demo
+from training.demo import DemoConfig
+from training.planner import InverseConfig
+
+SMALL = DemoConfig(
+    hops=16,
+    targets=4,
+    surrogate=TrainConfig(net=NetConfig(hidden=(16,), members=2), epochs=20, test=0.0),
+    planner=InverseConfig(pool=64, starts=2, steps=5),
+    gradient_steps=1,
+    progress=False,
+)
+PICTURES = ("hop.png", "energies.png", "landing_map.png", "scatter.png", "plans.png", "error_calls.png")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished small demo."""
+    folder = tmp_path_factory.mktemp("demo")
+    demo.run(replace(SMALL, out=folder))
+    return folder
+
+
+def test_whole_chain_leaves_data_models_pictures_and_a_closed_report(folder: Path) -> None:
+    for name in (*PICTURES, "data.h5", "targets.h5", "surrogate_16.safetensors", "policy.safetensors", "report.html"):
+        assert (folder / name).stat().st_size > 1000, name
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == len(PICTURES)
+    assert not re.search(r"(src|href)=\"(?!data:)", page)  # nothing is fetched from elsewhere
+    for text in ("nearest stored hop", "planner (surrogate inverted)", "policy (SAC)", "of reach", "of the stored energy"):
+        assert text in page
+    assert not list(folder.glob("**/*.partial"))
+
+
+def test_rerun_keeps_all_and_goes_on_where_something_is_missing(folder: Path) -> None:
+    before = (folder / "report.html").read_bytes()
+    again = demo.run(replace(SMALL, out=folder))
+    assert set(again.skipped) == set(again.results)
+    assert (folder / "report.html").read_bytes() == before
+    (folder / "surrogate_16.safetensors").unlink()
+    (folder / "stages" / "plans.json").write_text("{ damaged")
+    (folder / "plans.png").unlink()
+    third = demo.run(replace(SMALL, out=folder))
+    assert set(third.results) - set(third.skipped) == {"surrogate_16", "plans", "report"}
+    rows = [{k: v for k, v in row.items() if "seconds" not in k} for row in again.results["report"]["rows"]]
+    assert rows == [{k: v for k, v in row.items() if "seconds" not in k} for row in third.results["report"]["rows"]]
+
+
+def test_errors_of_every_method_are_counted_in_metres_and_reaches(folder: Path) -> None:
+    rows = demo.run(replace(SMALL, out=folder)).results["report"]["rows"]
+    assert [row["simulator_calls"] for row in rows] == [16, 16, 16]
+    for row in rows:
+        assert row["median_percent"] / row["median_error"] == pytest.approx(row["mean_percent"] / row["mean_error"])
+
+
+def test_another_seed_in_the_same_folder_is_refused(folder: Path) -> None:
+    before = (folder / "data.h5").read_bytes()
+    with pytest.raises(DataFileError, match="seed: expected 7, got 0"):
+        demo.run(replace(SMALL, out=folder, seed=7))
+    assert (folder / "data.h5").read_bytes() == before
+
+
+def test_bad_sizes_and_folders_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidParameterError, match="hops >= 4"):
+        demo.run(replace(SMALL, out=tmp_path, hops=1))
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(OutputFolderError, match="--out"):
+        demo.run(replace(SMALL, out=tmp_path / "file" / "demo"))
+
+
+def test_command_line_says_the_error_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    command = [sys.executable, "-m", "training", "demo", "--out", str(tmp_path / "file" / "demo")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ, cwd=Path(__file__).parents[1])
+    assert done.returncode == 1
+    assert done.stderr.strip().startswith("OutputFolderError: expected a folder")
+    assert "Traceback" not in done.stderr

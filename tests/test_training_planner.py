@@ -1,0 +1,104 @@
+"""Planners: known inverses of closed-form maps, the box, unreachable targets, bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from surrogate.generate import sample_stretches
+from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from training.planner import InversePlanner, NearestHopPlanner, targets_of
+from training.policies import ActorPolicy, _mlp
+
+
+def throw(stretches: Tensor) -> Tensor:
+    """Ballistic throw: two numbers steer speed and elevation, two the azimuth; as an ensemble of one, (1, n, 2) [m]."""
+    speed = 1.0 + 2.0 * stretches[:, 0]
+    elevation = 0.4 + stretches[:, 1]
+    azimuth = 6.0 * (stretches[:, 2] - stretches[:, 3])
+    distance = speed**2 * torch.sin(2 * elevation) / 9.81
+    return torch.stack([distance * torch.cos(azimuth), distance * torch.sin(azimuth)], dim=-1)[None]
+
+
+def arm(stretches: Tensor) -> Tensor:
+    """Planar arm of four links: the angles add up; (1, n, 2) [m]."""
+    angles = torch.cumsum(4.0 * (stretches - 0.5), dim=1)
+    return 0.25 * torch.stack([torch.cos(angles).sum(dim=1), torch.sin(angles).sum(dim=1)], dim=-1)[None]
+
+
+@pytest.mark.parametrize("reach", [throw, arm])
+def test_recovers_inverses_of_closed_form_maps(reach) -> None:
+    hidden = torch.from_numpy(sample_stretches(40, 11).astype(np.float32))
+    targets = reach(hidden)[0].numpy()
+    stretches, _ = InversePlanner(reach).predict(targets)
+    landings = reach(torch.from_numpy(stretches.astype(np.float32)))[0].numpy()
+    assert np.linalg.norm(landings - targets, axis=1).max() < 1e-3
+    assert stretches.min() >= 0.2
+    assert stretches.max() <= 0.8
+
+
+def test_answers_on_the_boundary_of_the_box_are_reached() -> None:
+    def linear(stretches: Tensor) -> Tensor:
+        return stretches[None, :, :2]
+
+    stretches, expected = InversePlanner(linear).plan(np.array([(0.2, 0.8), (0.1, 0.9)]))
+    np.testing.assert_allclose(stretches[:, :2], [(0.2, 0.8)] * 2, atol=1e-6)
+    # the second target is out of reach: the nearest landing, and said so
+    np.testing.assert_allclose(expected, [0.0, np.hypot(0.1, 0.1)], atol=1e-5)
+
+
+def test_prefers_stretches_that_the_members_agree_on() -> None:
+    def doubtful(stretches: Tensor) -> Tensor:
+        """Two members: both put every hop at s0, but for s1 > 0.5 they disagree about y."""
+        doubt = torch.relu(stretches[:, 1] - 0.5)
+        return torch.stack([torch.stack([stretches[:, 0], sign * doubt], dim=-1) for sign in (1.0, -1.0)])
+
+    stretches, _ = InversePlanner(doubtful).predict(np.array([(0.4, 0.0), (0.6, 0.0)]))
+    assert (stretches[:, 1] <= 0.5 + 1e-3).all()
+
+
+def test_same_question_same_answer_and_single_or_batch() -> None:
+    planner = InversePlanner(throw)
+    targets = np.array([(0.3, 0.1), (0.2, -0.2)])
+    batch, _ = planner.predict(targets)
+    assert np.array_equal(batch, planner.predict(targets)[0])
+    single, state = planner.predict(targets[0])
+    assert single.shape == (4,)
+    assert state is None
+    np.testing.assert_allclose(single, batch[0], atol=1e-4)
+
+
+def test_nearest_hop_is_the_nearest() -> None:
+    stretches = sample_stretches(50, 0)
+    landings = np.random.default_rng(0).normal(size=(50, 2))
+    planner = NearestHopPlanner(stretches, landings)
+    assert np.array_equal(planner.predict(landings + 1e-9)[0], stretches)
+    with pytest.raises(InvalidParameterError, match="at least one"):
+        NearestHopPlanner(stretches[:0], landings[:0])
+
+
+@pytest.mark.parametrize("bad", [np.array((np.nan, 0.0)), np.array(0.3), np.zeros((2, 1)), np.zeros((2, 2, 2))])
+def test_targets_that_are_none_are_named(bad: np.ndarray) -> None:
+    with pytest.raises(InvalidParameterError, match="targets"):
+        targets_of(bad)
+
+
+def test_actor_round_trip_and_refusals(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    actor = ActorPolicy(_mlp([2, 8, 4]), scale=0.5)
+    targets = np.random.default_rng(0).normal(size=(20, 2))
+    path = actor.save(tmp_path / "actor.safetensors", {"seed": 0})
+    assert np.array_equal(ActorPolicy.load(path).predict(targets)[0], actor.predict(targets)[0])
+    assert actor.predict(targets[0])[0].shape == (4,)
+    assert (np.abs(actor.predict(1e6 * targets)[0] - 0.5) <= 0.3 + 1e-12).all()
+    with pytest.raises(InvalidParameterError, match="observation"):
+        actor.predict(np.zeros(5))
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(DataFileError, match="checksum"):
+        ActorPolicy.load(path)
+    with pytest.raises(DataFileError, match="readable JSON"):
+        ActorPolicy.load(tmp_path / "absent.safetensors")

@@ -1,0 +1,131 @@
+"""From targets to stretches. Every planner has stable-baselines3's ``predict`` signature, so that one scorer fits all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogate.generate import sample_stretches
+from tensegrity_gym import STRETCH_RANGE
+from tensegrity_gym.errors import InvalidParameterError
+
+Prediction = tuple[np.ndarray, Any]
+
+
+class Planner(Protocol):
+    """Anything that answers observations with stretches: the planners here, and policies."""
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Prediction:
+        """Observations whose first two numbers are the target [m], (2,) or (n, 2), to stretches (4,) or (n, 4)."""
+        ...
+
+
+def targets_of(observation: np.ndarray) -> np.ndarray:
+    """The targets in one observation or a batch of them, shape (n, 2) [m]; InvalidParameterError if they are none."""
+    targets = np.atleast_2d(np.asarray(observation, dtype=np.float64))
+    if targets.ndim != 2 or targets.shape[1] < 2 or not np.isfinite(targets).all():
+        raise InvalidParameterError(f"observation: expected finite targets (2,) or (n, 2) [m], got {observation!r}")
+    return targets[:, :2]
+
+
+class NearestHopPlanner:
+    """Repeat the stored hop that landed nearest to the target: the baseline that every other planner must beat."""
+
+    def __init__(self, stretches: np.ndarray, landings: np.ndarray) -> None:
+        if len(stretches) == 0 or len(stretches) != len(landings):
+            raise InvalidParameterError(
+                f"expected as many stretches as landings, at least one, got {len(stretches)} and {len(landings)}"
+            )
+        self.stretches = np.asarray(stretches, dtype=np.float64)
+        self.landings = np.asarray(landings, dtype=np.float64)
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Prediction:
+        """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4)."""
+        distance = np.linalg.norm(targets_of(observation)[:, None] - self.landings, axis=2)
+        chosen = self.stretches[distance.argmin(axis=1)]
+        return (chosen[0] if np.ndim(observation) == 1 else chosen), state
+
+
+@dataclass(frozen=True)
+class InverseConfig:
+    """Multi-start gradient descent through the surrogate."""
+
+    pool: int = 4096
+    """Spread-out stretches that the starts are chosen from."""
+    starts: int = 16
+    """Descents per target."""
+    steps: int = 120
+    """Adam steps per descent."""
+    lr: float = 0.02
+    """Adam's learning rate at the first step, in stretches; it falls to zero along a cosine."""
+
+
+class InversePlanner:
+    """Find the stretches whose expected squared landing error, over the ensemble's members, is least.
+
+    That is the squared error of the mean plus the members' spread, so among equals it takes the stretches that the
+    surrogate is surest of. Descent is on the stretches themselves, put back into the box after every step, so that answers
+    on its boundary are reached (a sigmoid would stall there).
+
+    Args:
+        landing: stretches, shape (n, n_actuators), to landings as each member sees them, shape (members, n, 2) [m].
+    """
+
+    def __init__(
+        self, landing: Callable[[Tensor], Tensor], config: InverseConfig | None = None, *, n_actuators: int = 4, seed: int = 0
+    ) -> None:
+        self.landing = landing
+        self.config = config or InverseConfig()
+        self.pool = torch.from_numpy(sample_stretches(self.config.pool, seed, n_actuators).astype(np.float32))
+        with torch.no_grad():
+            self.pool_landings = landing(self.pool)
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Prediction:
+        """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4); unreachable ones get the nearest landing it knows."""
+        stretches, _ = self.plan(targets_of(observation))
+        return (stretches[0] if np.ndim(observation) == 1 else stretches), state
+
+    def plan(self, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Targets (n, 2) [m] to stretches (n, n_actuators) and the expected landing error (rms) of each, (n,) [m]."""
+        goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))[:, None]  # (n, 1, 2)
+        with torch.no_grad():
+            cost = ((self.pool_landings[:, None] - goal) ** 2).sum(dim=-1).mean(dim=0)  # (n, pool)
+            first = cost.topk(min(self.config.starts, len(self.pool)), largest=False).indices
+        stretches = self._descend(self.pool[first], goal)
+        with torch.no_grad():
+            cost = self._cost(stretches, goal)
+            best = cost.argmin(dim=1)
+        rows = torch.arange(len(best))
+        # float32 cannot hold 0.2 and 0.8: cut the overshoot off
+        chosen = np.clip(stretches[rows, best].numpy().astype(np.float64), *STRETCH_RANGE)
+        return chosen, np.sqrt(cost[rows, best].numpy())
+
+    def _descend(self, start: Tensor, goal: Tensor) -> Tensor:
+        stretches = start.clone().requires_grad_(True)
+        optimiser = torch.optim.Adam([stretches], lr=self.config.lr, betas=(0.9, 0.99))
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, self.config.steps)
+        for _ in range(self.config.steps):
+            cost = self._cost(stretches, goal).sum()
+            (stretches.grad,) = torch.autograd.grad(cost, [stretches])
+            optimiser.step()
+            schedule.step()
+            with torch.no_grad():
+                stretches.clamp_(*STRETCH_RANGE)
+        return stretches.detach()
+
+    def _cost(self, stretches: Tensor, goal: Tensor) -> Tensor:
+        """Expected squared error [m^2] of stretches (n, starts, n_actuators), shape (n, starts)."""
+        seen = self.landing(stretches.reshape(-1, stretches.shape[-1]))
+        seen = seen.reshape(seen.shape[0], *stretches.shape[:2], 2)
+        return ((seen - goal) ** 2).sum(dim=-1).mean(dim=0)

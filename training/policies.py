@@ -1,0 +1,98 @@
+"""A trained actor kept as safetensors and a card: the policy without the pickle that stable-baselines3's zip is."""
+
+from __future__ import annotations
+
+import hashlib
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import nn
+
+from surrogate.storage import atomic_path, ensure_folder, read_json, write_json
+from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE
+from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from training.planner import Prediction
+
+FORMAT = "tensegrity_gym.actor/1"
+
+
+class ActorPolicy:
+    """Deterministic actor: observation / ``scale`` through a ReLU MLP and tanh, then onto the range of stretches."""
+
+    def __init__(self, layers: nn.Sequential, scale: float) -> None:
+        self.layers = layers.eval()
+        self.scale = float(scale)
+
+    @classmethod
+    def from_sac(cls, model: Any, scale: float) -> ActorPolicy:
+        """Copy the actor of a stable-baselines3 SAC trained on observations / ``scale`` and actions in [-1, 1]."""
+        actor = model.policy.actor
+        found = [layer for layer in [*actor.latent_pi, actor.mu] if isinstance(layer, nn.Linear)]
+        copy = _mlp([found[0].in_features, *(layer.out_features for layer in found)])
+        for mine, theirs in zip(list(copy)[::2], found, strict=True):
+            mine.load_state_dict(theirs.state_dict())
+        return cls(copy, scale)
+
+    @torch.no_grad()
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Prediction:
+        """Observations (d,) or (n, d) to stretches (4,) or (n, 4)."""
+        batch = np.atleast_2d(np.asarray(observation, dtype=np.float32))
+        width = self.layers[0].in_features
+        if batch.ndim != 2 or batch.shape[1] != width or not np.isfinite(batch).all():
+            raise InvalidParameterError(f"observation: expected finite numbers ({width},) or (n, {width}), got {observation!r}")
+        low, high = STRETCH_RANGE
+        share = (torch.tanh(self.layers(torch.from_numpy(batch / self.scale))).numpy().astype(np.float64) + 1) / 2
+        stretches = np.clip(low + (high - low) * share, low, high)
+        return (stretches[0] if np.ndim(observation) == 1 else stretches), state
+
+    def save(self, path: Path | str, card: dict[str, Any]) -> Path:
+        """Write weights (safetensors) and, beside them, the card with their checksum (.json)."""
+        path = Path(path)
+        ensure_folder(path.parent)
+        content = save_tensors(self.layers.state_dict())
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content)
+        fixed = {
+            "format": FORMAT,
+            "model_version": MODEL_VERSION,
+            "scale": self.scale,
+            "sha256": hashlib.sha256(content).hexdigest(),
+        }
+        write_json(path.with_suffix(".json"), card | fixed)
+        return path
+
+    @classmethod
+    def load(cls, path: Path | str) -> ActorPolicy:
+        """Read a saved actor; DataFileError for a missing, damaged or foreign one."""
+        path = Path(path)
+        card = read_json(path.with_suffix(".json"))
+        for name, value in {"format": FORMAT, "model_version": MODEL_VERSION}.items():
+            came = card.get(name) if isinstance(card, dict) else None
+            if came != value:
+                raise DataFileError(f"{path}: expected an actor with {name} {value!r}, got {came!r}; train it again")
+        try:
+            content = path.read_bytes()
+            if hashlib.sha256(content).hexdigest() != card["sha256"]:
+                raise ValueError(f"its checksum is not {card['sha256']}, as the card says")
+            state = load_tensors(content)
+            weights = [state[name] for name in sorted(state, key=lambda n: int(n.split(".")[0])) if name.endswith("weight")]
+            layers = _mlp([weights[0].shape[1], *(w.shape[0] for w in weights)])
+            layers.load_state_dict(state)
+            return cls(layers, card["scale"])
+        except (OSError, ValueError, KeyError, IndexError, TypeError, RuntimeError, SafetensorError) as error:
+            raise DataFileError(f"{path}: expected a whole actor checkpoint ({error}); train it again") from error
+
+
+def _mlp(widths: list[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for fan_in, fan_out in pairwise(widths):
+        layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])

@@ -1,0 +1,205 @@
+"""Train a policy with stable-baselines3 through ``gym.make("TensegrityHop-v0")``."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+from tqdm import tqdm
+
+import tensegrity_gym  # noqa: F401  registers the env
+from tensegrity_gym import Scene
+from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.task import reach
+from training.policies import ActorPolicy
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """SAC on one-step episodes: nothing follows a hop, so gamma is 0 and the critic learns the reward itself.
+
+    Automatic entropy would drown a reward of this size in exploration; a small constant does not.
+    """
+
+    calls: int = 256
+    """Hops that training may simulate."""
+    seed: int = 0
+    """Seed of weights, exploration and targets."""
+    learning_rate: float = 1e-3
+    """Adam's learning rate of actor and critics."""
+    ent_coef: float = 0.001
+    """Weight of the entropy in the objective."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of actor and critics."""
+    batch_size: int = 64
+    """Hops per gradient step."""
+    gradient_steps: int = 8
+    """Gradient steps per hop."""
+    warmup: float = 0.125
+    """Share of the hops with random stretches before learning starts."""
+    envs: int = 2
+    """Envs stepped side by side, one thread each."""
+
+
+@dataclass(frozen=True)
+class PolicyCommand(PolicyConfig):
+    """Train a SAC policy on the env and keep its actor."""
+
+    out: Path = Path("runs/policy.safetensors")
+    """Checkpoint to write; its card goes beside it as .json."""
+    scene: str = "earth"
+    """Scene preset."""
+
+
+class ScaledObservation(gym.ObservationWrapper):
+    """Observations over a fixed scale, so that the nets see numbers of order one."""
+
+    def __init__(self, env: gym.Env, scale: float) -> None:
+        super().__init__(env)
+        self.scale = np.float32(scale)
+        box = env.observation_space
+        assert isinstance(box, gym.spaces.Box)
+        self.observation_space = gym.spaces.Box(box.low / self.scale, box.high / self.scale, dtype=np.float32)
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """Scaled observation, shape as it came."""
+        return observation / self.scale
+
+
+class ThreadedVecEnv(DummyVecEnv):
+    """Envs stepped at the same time in threads: the simulator leaves Python's lock alone while it runs."""
+
+    def __init__(self, env_fns: Sequence[Any]) -> None:
+        super().__init__(list(env_fns))
+        self.pool = ThreadPoolExecutor(len(self.envs))
+
+    def step_wait(self) -> Any:
+        """Step all envs; as DummyVecEnv does, one after the other, with the physics already under way."""
+        running = [self.pool.submit(env.step, action) for env, action in zip(self.envs, self.actions, strict=True)]
+        plain = self.envs
+        try:
+            self.envs = [_Stepped(env, future) for env, future in zip(plain, running, strict=True)]  # type: ignore[misc]
+            return super().step_wait()
+        finally:
+            self.envs = plain
+
+    def close(self) -> None:
+        """Stop the threads, close the envs."""
+        self.pool.shutdown()
+        super().close()
+
+
+class _Stepped:
+    """Stands in for an env whose step is already running."""
+
+    def __init__(self, env: gym.Env, future: Any) -> None:
+        self.env, self.future = env, future
+
+    def step(self, action: np.ndarray) -> Any:
+        return self.future.result()
+
+    def reset(self, **options: Any) -> Any:
+        return self.env.reset(**options)
+
+
+class _Watch(BaseCallback):
+    """Moves the progress bar and copies the actor whenever a budget of simulator calls is spent."""
+
+    def __init__(self, budgets: Sequence[int], scale: float, bar: tqdm) -> None:
+        super().__init__()
+        self.budgets, self.scale, self.bar = sorted(budgets), scale, bar
+        self.snapshots: dict[int, ActorPolicy] = {}
+
+    def _on_step(self) -> bool:
+        self.bar.update(self.num_timesteps - self.bar.n)
+        error = np.mean([info["error"] for info in self.locals["infos"]])
+        self.bar.set_postfix(error=f"{error:.3f} m", refresh=False)
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.keep()  # training on the last hops is over when the next are collected
+
+    def keep(self) -> None:
+        """Copy the actor if a budget is spent that has no copy yet."""
+        for budget in self.budgets:
+            if self.num_timesteps >= budget and budget not in self.snapshots:
+                self.snapshots[budget] = ActorPolicy.from_sac(self.model, self.scale)
+
+
+class ScaledAction(gym.ActionWrapper):
+    """Actions in [-1, 1] onto the env's range; gymnasium's RescaleAction rounds beyond its ends, this one does not."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        box = env.action_space
+        assert isinstance(box, gym.spaces.Box)
+        self.box = box
+        self.action_space = gym.spaces.Box(-1.0, 1.0, shape=box.shape, dtype=np.float32)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """Stretches, shape as it came."""
+        low, high = self.box.low, self.box.high
+        return np.clip(low + (high - low) * (action + 1) / 2, low, high)
+
+
+def make_env(scene: Scene | str, scale: float) -> gym.Env:
+    """The registered env with observations over ``scale`` [m] and actions rescaled to [-1, 1], as policies want them."""
+    env = gym.make("TensegrityHop-v0", scene=scene)
+    return ScaledAction(ScaledObservation(env, scale))
+
+
+def train_policy(
+    scene: Scene, config: PolicyConfig, *, budgets: Sequence[int] = (), progress: bool = True
+) -> tuple[dict[int, ActorPolicy], dict[str, Any]]:
+    """Train SAC for ``config.calls`` hops; returns actors as they were after each of ``budgets`` hops, and a card.
+
+    The last actor, after all the hops, is always among them.
+    """
+    if config.calls < 1 or any(not 0 < b <= config.calls for b in budgets):
+        raise InvalidParameterError(
+            f"calls and budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}"
+        )
+    started = time.perf_counter()
+    scale = reach(scene)
+    envs = config.envs if config.calls % config.envs == 0 else 1  # every env steps at once, and no hop may be over budget
+    with contextlib.closing(ThreadedVecEnv([lambda: make_env(scene, scale)] * envs)) as venv:
+        model = SAC(
+            "MlpPolicy",
+            venv,
+            gamma=0.0,
+            learning_rate=config.learning_rate,
+            ent_coef=config.ent_coef,
+            batch_size=config.batch_size,
+            gradient_steps=config.gradient_steps * envs,
+            learning_starts=max(int(config.warmup * config.calls), envs),
+            buffer_size=max(config.calls, envs),
+            policy_kwargs={"net_arch": list(config.hidden), "activation_fn": torch.nn.ReLU},
+            seed=config.seed,
+            device="cpu",
+        )
+        with tqdm(total=config.calls, unit="hop", desc="policy (SAC)", disable=not progress, mininterval=0.5) as bar:
+            watch = _Watch([*budgets, config.calls], scale, bar)
+            model.learn(config.calls, callback=watch)
+            watch.keep()
+        calls = sum(cast(Any, env.unwrapped).simulator_calls for env in venv.envs)
+    card = {"algorithm": "SAC", "train": asdict(config), "scene": asdict(scene), "simulator_calls": calls}
+    return watch.snapshots, card | {"seconds": time.perf_counter() - started}
+
+
+def main(config: PolicyCommand) -> None:
+    """Entry of ``python -m training policy``."""
+    actors, card = train_policy(Scene.preset(config.scene), config)
+    card["train"] = {k: str(v) if isinstance(v, Path) else v for k, v in card["train"].items()}
+    actors[config.calls].save(config.out, card)
+    print(f"{config.out}: SAC, {card['simulator_calls']} simulator calls in {card['seconds']:.1f} s")
