@@ -90,9 +90,8 @@ def reach(scene: str = "earth", hops: int = 256, seed: int = 0) -> None:
         hops: how many hops to simulate.
         seed: of the Sobol sequence.
     """
-    for landing in ("rest", "touchdown"):
-        where = Scene.preset(scene, landing=landing)
-        measured, documented = task.measure_reach(where, hops, seed), task.reach_of(where)
+    for landing, measured in task.measure_reach(Scene.preset(scene), hops, seed).items():
+        documented = task.REACHES[scene][landing]
         print(
             f"{scene:<6} {landing:<9}  radius {measured.radius:.3f} m, downhill {measured.downhill:.3f} m   "
             f"(documented: {documented.radius:.3f} m, {documented.downhill:.3f} m)"

@@ -11,9 +11,10 @@ from gymnasium import spaces
 
 from tensegrity_gym import task
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError, ResetNeededError
+from tensegrity_gym.formfinding import STRETCH_RANGE
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.simulate import STRETCH_RANGE, HopResult, simulate
+from tensegrity_gym.simulate import HopResult, simulate
 from tensegrity_gym.types import HopStatus
 
 #: Rate at which a hop is recorded for rendering [1/s].

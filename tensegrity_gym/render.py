@@ -82,7 +82,7 @@ def filmstrip(
 
     top = float(points[..., 2].max())
     camera = Camera(azimuth=np.radians(-75.0), distance=np.inf)
-    width = max(1.32 * len(shown) + 0.5, (top + 1.25) * size[0] / size[1])
+    width = max(1.5 * len(shown) + 0.5, (top + 1.25) * size[0] / size[1])
     camera = replace(camera, width=width, centre=(0.0, 0.0, (top - 0.3) / 2))
     right = camera.axes[0]
     columns = ((np.arange(len(shown)) + 0.5) / len(shown) - 0.5) * (width - 0.5)

@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
 from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.formfinding import STRETCH_RANGE
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.simulate import STRETCH_RANGE, simulate
+from tensegrity_gym.simulate import simulate
 from tensegrity_gym.types import Floats, HopStatus
 
 #: Reward of a hop that failed (unstable or not converged), and the least reward that any hop gets [reaches].
@@ -72,14 +73,21 @@ def reachable_middle(scene: Scene) -> Floats:
     return reach_of(scene).downhill * np.array((np.cos(scene.slope_direction), np.sin(scene.slope_direction)))
 
 
-def measure_reach(scene: Scene, hops: int = 256, seed: int = 0) -> Reach:
-    """Simulate ``hops`` hops with Sobol stretches and return the disc that holds 95 % of their landings."""
+def measure_reach(scene: Scene, hops: int = 256, seed: int = 0) -> dict[str, Reach]:
+    """Simulate ``hops`` hops with Sobol stretches; for "rest" and "touchdown", the disc that holds 95 % of landings."""
     low, high = STRETCH_RANGE
     sobol = qmc.Sobol(d=4, seed=seed).random_base2(int(np.ceil(np.log2(hops))))[:hops]
     result = simulate(low + (high - low) * sobol, scene=scene)
-    landing = result.landing[~failed(result.status)]
-    if len(landing) == 0:
+    landed = ~failed(result.status)
+    if not landed.any():
         raise InvalidParameterError(f"measure_reach: expected at least one of {hops} hops to succeed in {scene}, none did")
+    return {
+        "rest": _disc_of(result.rest[landed], scene),
+        "touchdown": _disc_of(result.touchdown[landed & (result.flight_time > 0)], scene),
+    }
+
+
+def _disc_of(landing: Floats, scene: Scene) -> Reach:
     direction = np.array((np.cos(scene.slope_direction), np.sin(scene.slope_direction)))
     downhill = float(landing.mean(axis=0) @ direction) if scene.slope > 0 else 0.0
     return Reach(float(np.quantile(np.linalg.norm(landing - downhill * direction, axis=1), 0.95)), downhill)

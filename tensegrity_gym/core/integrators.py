@@ -1,0 +1,51 @@
+"""One step of a batch of lattices, given their force function.
+
+Symplectic Euler with a leapfrog start: positions at whole steps, velocities at half steps, second order. Within a step the
+order is collisions, velocities, contacts, positions: with any other a block at rest on an incline creeps or bounces.
+"""
+
+from __future__ import annotations
+
+from tensegrity_gym.core.contact import contact_impulse
+from tensegrity_gym.core.forces import dot
+from tensegrity_gym.core.jit import jit
+from tensegrity_gym.core.lanes import any_lane, fma, load, select, store
+
+
+@jit
+def symplectic_euler_step(forces, structure, actuator_length, ground, dt, kick, x, v, f, memory):
+    """Advance x [m] and v [m/s] by one step; ``kick`` [s] is dt, or dt/2 in a lane's first step from rest.
+
+    ``forces(structure, actuator_length, gravity, x, v, f, memory)`` fills f [N] and returns the power damping dissipates [W].
+    Returns (that power, energy that contacts dissipated in this step [J], lowest z after it [m]).
+    """
+    power = forces(structure, actuator_length, ground.gravity, x, v, f, memory)
+    dissipated = power * 0.0
+    lowest = load(x, 0, 2) + 1e30
+    for i in range(structure.mass.shape[0]):
+        inverse = kick / structure.mass[i]
+        vx, vy, vz = load(v, i, 0), load(v, i, 1), load(v, i, 2)
+        px, py, pz = load(x, i, 0), load(x, i, 1), load(x, i, 2)
+        ax, ay, az = load(f, i, 0) * inverse, load(f, i, 1) * inverse, load(f, i, 2) * inverse
+        touching = pz <= 0.0
+        if any_lane(touching):
+            cx, cy, cz = contact_impulse(vx, vy, vz, touching, ground.friction, ground.restitution)
+            kx, ky, kz = cx + ax, cy + ay, cz + az
+            # the second pass only takes away what this step's forces push into the ground: a resting contact, e = 0
+            nx, ny, nz = contact_impulse(kx, ky, kz, touching, ground.friction, 0.0)
+            # work of the contact impulse at the mean of the velocities before and after, so that rest costs nothing
+            jx, jy, jz = nx - vx - ax, ny - vy - ay, nz - vz - az
+            work = 0.5 * structure.mass[i] * dot(jx, jy, jz, vx + nx, vy + ny, vz + nz)
+            dissipated = select(touching, dissipated - work, dissipated)
+            vx, vy, vz = nx, ny, nz
+        else:
+            vx, vy, vz = vx + ax, vy + ay, vz + az
+        pz = fma(vz, dt, pz)
+        store(v, i, 0, vx)
+        store(v, i, 1, vy)
+        store(v, i, 2, vz)
+        store(x, i, 0, fma(vx, dt, px))
+        store(x, i, 1, fma(vy, dt, py))
+        store(x, i, 2, pz)
+        lowest = select(pz < lowest, pz, lowest)
+    return power, dissipated, lowest

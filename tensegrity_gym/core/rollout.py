@@ -1,0 +1,337 @@
+"""A batch of hops: each lane runs one hop from release to rest and then takes the next one from the queue.
+
+Lanes never see each other, so a hop gives the same bits whatever its lane, its neighbours, its thread or the batch's order.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tensegrity_gym.core.energy import actuator_energy, bar_energy, cable_energy, gravitational_energy, kinetic_energy
+from tensegrity_gym.core.forces import lattice_forces
+from tensegrity_gym.core.integrators import symplectic_euler_step
+from tensegrity_gym.core.jit import jit
+from tensegrity_gym.core.lanes import any_lane, fma, load, load1, select, splat, store, store1
+
+RESTED, TIME_LIMIT, NO_FLIGHT, UNSTABLE = 0, 1, 2, 3  # as types.HopStatus; numba takes plain integers
+RELEASE, TAKEOFF, TOUCHDOWN, END = 0, 1, 2, 3  # rows of HopRecords.state
+
+
+class HopSettings(NamedTuple):
+    """How hops are stepped, watched and ended."""
+
+    dt: float  #: step [s]
+    max_steps: int  #: longest hop [steps], a multiple of ``stride``
+    stride: int  #: steps between two looks at rest, blow-up and frames
+    rest_energy: float  #: kinetic energy below which a lattice on the ground counts as quiet [J]
+    rest_steps: int  #: how long it must stay quiet [steps]
+    runaway_energy: float  #: kinetic energy that no sane hop reaches [J]
+    frame_stride: int  #: steps between two frames, a multiple of ``stride``; 0 for no frames
+
+
+class HopRecords(NamedTuple):
+    """What each hop leaves behind; events are release, take-off, touchdown and end."""
+
+    state: np.ndarray  #: positions [m] and velocities [m/s] at the events, shape (n, 4, 2, n_masses, 3)
+    time: np.ndarray  #: of the events [s], shape (n, 4)
+    dissipated: np.ndarray  #: by contact and by damping until the events [J], shape (n, 4, 2)
+    touchdown_shift: np.ndarray  #: from the touchdown state back to the instant of contact [s], shape (n,)
+    height: np.ndarray  #: highest z of the centre of mass [m], shape (n,)
+    steps: np.ndarray  #: steps taken, shape (n,)
+    status: np.ndarray  #: HopStatus, shape (n,)
+    frame_positions: np.ndarray  #: [m], shape (n, n_frames, n_masses, 3); n_frames is 0 without frames
+    frame_times: np.ndarray  #: [s], shape (n, n_frames)
+    frame_energies: np.ndarray  #: [J], columns types.ENERGY_NAMES, shape (n, n_frames, 7)
+    frame_count: np.ndarray  #: valid frames, shape (n,)
+
+
+class LaneState(NamedTuple):
+    """State of the lanes of one thread; the last axis is the lane."""
+
+    x: np.ndarray  #: positions [m], shape (n_masses, 3, lanes)
+    v: np.ndarray  #: velocities half a step before [m/s], shape (n_masses, 3, lanes)
+    f: np.ndarray  #: forces [N], shape (n_masses, 3, lanes)
+    memory: np.ndarray  #: last damping force of each axial member [N], shape (n_axial_members, lanes)
+    mid: np.ndarray  #: scratch positions [m], shape (n_masses, 3, lanes)
+    actuator_length: np.ndarray  #: natural lengths [m], shape (n_actuators, lanes)
+    scalars: np.ndarray  #: rows named below, shape (N_SCALARS, lanes)
+    hop: np.ndarray  #: which hop each lane runs, -1 for none, shape (lanes,)
+    step: np.ndarray  #: steps it has taken, shape (lanes,)
+    quiet: np.ndarray  #: for how many steps it has been quiet on the ground, shape (lanes,)
+    flown: np.ndarray  #: whether its flight is behind it, shape (lanes,)
+
+
+KICK, CONTACT_LOSS, DAMPING_LOSS, AIRBORNE, LOWEST, KINETIC, HEIGHT, WAS_AIRBORNE, WAS_LOWEST = 0, 1, 2, 3, 4, 5, 6, 7, 8
+FRAME = 9  # five rows of frame energies start here
+N_SCALARS = 14
+
+
+@jit(forceinline=False)
+def load_hop(lanes, lane, positions, dt):
+    """Put a hop at rest in ``positions`` (n_masses, 3) into a lane."""
+    lowest = 1e30
+    for i in range(positions.shape[0]):
+        for c in range(3):
+            lanes.x[i, c, lane] = positions[i, c]
+            lanes.v[i, c, lane] = 0.0
+        lowest = min(lowest, positions[i, 2])
+    for row in range(lanes.memory.shape[0]):
+        lanes.memory[row, lane] = 0.0
+    for row in range(N_SCALARS):
+        lanes.scalars[row, lane] = 0.0
+    lanes.scalars[KICK, lane] = 0.5 * dt  # leapfrog start: velocities live half a step behind
+    lanes.scalars[LOWEST, lane] = lowest
+    lanes.scalars[AIRBORNE, lane] = 1.0 if lowest > 0.0 else 0.0
+    lanes.scalars[HEIGHT, lane] = -1e30
+
+
+@jit(forceinline=False)
+def save_event(lanes, lane, records, hop, event, dt, time):
+    """Store a lane's state at the middle of the last step, where positions and velocities are synchronous."""
+    for i in range(lanes.x.shape[0]):
+        for c in range(3):
+            velocity = lanes.v[i, c, lane]
+            records.state[hop, event, 0, i, c] = lanes.x[i, c, lane] - 0.5 * dt * velocity
+            records.state[hop, event, 1, i, c] = velocity
+    records.time[hop, event] = time - 0.5 * dt
+    records.dissipated[hop, event, 0] = lanes.scalars[CONTACT_LOSS, lane]
+    records.dissipated[hop, event, 1] = lanes.scalars[DAMPING_LOSS, lane]
+
+
+@jit(forceinline=False)
+def copy_state(records, hop, source, target):
+    """The state of one event for another."""
+    for k in range(2):
+        for i in range(records.state.shape[3]):
+            for c in range(3):
+                records.state[hop, target, k, i, c] = records.state[hop, source, k, i, c]
+
+
+@jit(forceinline=False)
+def vertical_velocity(structure, lanes, lane):
+    """Vertical velocity of the centre of mass of one lane [m/s]."""
+    momentum, mass = 0.0, 0.0
+    for i in range(structure.mass.shape[0]):
+        momentum += structure.mass[i] * lanes.v[i, 2, lane]
+        mass += structure.mass[i]
+    return momentum / mass
+
+
+@jit(forceinline=False)
+def contact_change(structure, lanes, lane, records, hop, flown, dt, time):
+    """A lane left the ground or came back to it in the last step; returns whether its flight is now behind it.
+
+    Take-off is the last departure before touchdown; touchdown the first contact while the centre of mass descends. A foot
+    that still pushes while the body rises is no landing.
+    """
+    if flown:
+        return True
+    if lanes.scalars[AIRBORNE, lane] > 0.0:
+        save_event(lanes, lane, records, hop, TAKEOFF, dt, time)
+        return False
+    if records.time[hop, TAKEOFF] <= 0.0 or vertical_velocity(structure, lanes, lane) >= 0.0:
+        return False
+    save_event(lanes, lane, records, hop, TOUCHDOWN, dt, time)
+    before, after = lanes.scalars[WAS_LOWEST, lane], lanes.scalars[LOWEST, lane]
+    # contact at time - dt (1 - share), the state is at time - dt / 2
+    records.touchdown_shift[hop] = dt * (before / (before - after) - 0.5)
+    return True
+
+
+@jit
+def watch(structure, lanes):
+    """Fill the rows KINETIC and HEIGHT [J, m] of all lanes."""
+    store1(lanes.scalars, KINETIC, kinetic_energy(structure, lanes.v))
+    moment = load(lanes.x, 0, 2) * 0.0
+    mass = 0.0
+    for i in range(structure.mass.shape[0]):
+        moment = fma(structure.mass[i], load(lanes.x, i, 2), moment)
+        mass += structure.mass[i]
+    height = moment / mass
+    previous = load1(lanes.scalars, HEIGHT)
+    store1(lanes.scalars, HEIGHT, select(height > previous, height, previous))
+
+
+@jit(forceinline=False)
+def frame_energies(structure, ground, lanes, dt):
+    """Fill the five FRAME rows [J] with all lanes' energies at the middle of the last step.
+
+    Potential energies are means over the step's two ends: with the kinetic energy between them that is what leapfrog keeps.
+    """
+    for row in range(5):
+        store1(lanes.scalars, FRAME + row, load1(lanes.scalars, FRAME) * 0.0)
+    for back in range(2):
+        for i in range(structure.mass.shape[0]):
+            for c in range(3):
+                store(lanes.mid, i, c, fma(load(lanes.v, i, c), -back * dt, load(lanes.x, i, c)))
+        _add_half(lanes, FRAME, bar_energy(structure, lanes.mid))
+        _add_half(lanes, FRAME + 1, cable_energy(structure, lanes.mid))
+        _add_half(lanes, FRAME + 2, actuator_energy(structure, lanes.actuator_length, lanes.mid))
+        _add_half(lanes, FRAME + 4, gravitational_energy(structure, ground.gravity, lanes.mid))
+    store1(lanes.scalars, FRAME + 3, kinetic_energy(structure, lanes.v))
+
+
+@jit
+def _add_half(lanes, row, energy):
+    store1(lanes.scalars, row, fma(0.5, energy, load1(lanes.scalars, row)))
+
+
+@jit(forceinline=False)
+def save_frame(lanes, lane, records, hop, dt, time):
+    """Append one frame of a lane; ``frame_energies`` must be fresh."""
+    frame = records.frame_count[hop]
+    if frame >= records.frame_times.shape[1]:
+        return
+    records.frame_times[hop, frame] = time - 0.5 * dt
+    for i in range(lanes.x.shape[0]):
+        for c in range(3):
+            records.frame_positions[hop, frame, i, c] = lanes.x[i, c, lane] - 0.5 * dt * lanes.v[i, c, lane]
+    for k in range(5):
+        records.frame_energies[hop, frame, k] = lanes.scalars[FRAME + k, lane]
+    records.frame_energies[hop, frame, 5] = lanes.scalars[CONTACT_LOSS, lane]
+    records.frame_energies[hop, frame, 6] = lanes.scalars[DAMPING_LOSS, lane]
+    records.frame_count[hop] = frame + 1
+
+
+@jit(forceinline=False)
+def verdict(settings, lanes, lane, step, quiet, flown):
+    """HopStatus with which a lane's hop ends now, or -1 while it goes on."""
+    kinetic = lanes.scalars[KINETIC, lane]
+    if not kinetic < settings.runaway_energy:  # also true of NaN
+        return UNSTABLE
+    if quiet >= settings.rest_steps:
+        return RESTED if flown else NO_FLIGHT
+    if step >= settings.max_steps:
+        return TIME_LIMIT if flown else NO_FLIGHT
+    return -1
+
+
+@jit(forceinline=False)
+def end_hop(lanes, lane, records, hop, status, step, flown, dt):
+    """Store how a hop ended. A blown-up one ends where it started: a finite number that its status disowns."""
+    records.status[hop] = status
+    records.steps[hop] = step
+    records.height[hop] = lanes.scalars[HEIGHT, lane]
+    if status == UNSTABLE:
+        copy_state(records, hop, RELEASE, END)
+        records.height[hop] = 0.0
+        records.time[hop, END] = step * dt
+    else:
+        save_event(lanes, lane, records, hop, END, dt, step * dt)
+    if not flown:
+        for event in (TAKEOFF, TOUCHDOWN):
+            copy_state(records, hop, END, event)
+            records.time[hop, event] = records.time[hop, END]
+            records.dissipated[hop, event, 0] = records.dissipated[hop, END, 0]
+            records.dissipated[hop, event, 1] = records.dissipated[hop, END, 1]
+            records.touchdown_shift[hop] = 0.0
+
+
+@jit(forceinline=False)
+def next_hop(records, queue, last):
+    """First hop from ``queue`` on that has an equilibrium to start from; the others end where they would have started."""
+    while queue < last and records.status[queue] >= 0:
+        for event in (TAKEOFF, TOUCHDOWN, END):
+            copy_state(records, queue, RELEASE, event)
+        queue += 1
+    return queue
+
+
+@jit
+def rollout(forces, step_function, structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+    """Run hops ``first`` to ``last`` of ``records`` from their release states in one thread's lanes.
+
+    ``actuator_length`` [m], shape (n_actuators,), are the unlocked natural lengths; ``progress[0]`` counts ended hops.
+    """
+    count = lanes.x.shape[2]
+    dt = settings.dt
+    hop, step, quiet, flown = lanes.hop, lanes.step, lanes.quiet, lanes.flown
+    queue = first
+    running = 0
+    for lane in range(count):
+        hop[lane] = -1
+        step[lane] = 0
+        quiet[lane] = 0
+        flown[lane] = False
+        for k in range(actuator_length.shape[0]):
+            lanes.actuator_length[k, lane] = actuator_length[k]
+        load_hop(lanes, lane, records.state[first, RELEASE, 0], dt)  # idle lanes must hold a sane lattice too
+        queue = next_hop(records, queue, last)
+        if queue < last:
+            load_hop(lanes, lane, records.state[queue, RELEASE, 0], dt)
+            hop[lane] = queue
+            queue += 1
+            running += 1
+    while running > 0:
+        for k in range(settings.stride):
+            kick = load1(lanes.scalars, KICK)
+            power, lost, lowest = step_function(
+                forces, structure, lanes.actuator_length, ground, dt, kick, lanes.x, lanes.v, lanes.f, lanes.memory
+            )
+            store1(lanes.scalars, KICK, splat(dt, kick))
+            store1(lanes.scalars, CONTACT_LOSS, load1(lanes.scalars, CONTACT_LOSS) + lost)
+            store1(lanes.scalars, DAMPING_LOSS, fma(power, dt, load1(lanes.scalars, DAMPING_LOSS)))
+            was = load1(lanes.scalars, AIRBORNE)
+            now = select(lowest > 0.0, splat(1.0, was), splat(0.0, was))
+            changed = (was < now) | (was > now)
+            if any_lane(changed):
+                store1(lanes.scalars, AIRBORNE, now)
+                store1(lanes.scalars, WAS_AIRBORNE, was)
+                store1(lanes.scalars, WAS_LOWEST, load1(lanes.scalars, LOWEST))
+                store1(lanes.scalars, LOWEST, lowest)
+                for lane in range(count):
+                    if hop[lane] >= 0 and lanes.scalars[WAS_AIRBORNE, lane] != lanes.scalars[AIRBORNE, lane]:
+                        time = (step[lane] + k + 1) * dt
+                        flown[lane] = contact_change(structure, lanes, lane, records, hop[lane], flown[lane], dt, time)
+            store1(lanes.scalars, LOWEST, lowest)
+        watch(structure, lanes)
+        frames_due = False
+        for lane in range(count):
+            step[lane] += settings.stride
+            still = lanes.scalars[KINETIC, lane] < settings.rest_energy and lanes.scalars[AIRBORNE, lane] == 0.0
+            quiet[lane] = quiet[lane] + settings.stride if still else 0
+            if settings.frame_stride > 0 and hop[lane] >= 0 and step[lane] % settings.frame_stride == 0:
+                frames_due = True
+        if frames_due:
+            frame_energies(structure, ground, lanes, dt)
+        for lane in range(count):
+            if hop[lane] < 0:
+                continue
+            if frames_due and step[lane] % settings.frame_stride == 0:
+                save_frame(lanes, lane, records, hop[lane], dt, step[lane] * dt)
+            status = verdict(settings, lanes, lane, step[lane], quiet[lane], flown[lane])
+            if status < 0:
+                continue
+            end_hop(lanes, lane, records, hop[lane], status, step[lane], flown[lane], dt)
+            progress[0] += 1
+            hop[lane] = -1
+            running -= 1
+            queue = next_hop(records, queue, last)
+            if queue < last:
+                hop[lane] = queue
+                queue += 1
+                running += 1
+                step[lane] = 0
+                quiet[lane] = 0
+                flown[lane] = False
+                load_hop(lanes, lane, records.state[hop[lane], RELEASE, 0], dt)
+
+
+@jit(cache=True)
+def rollout_symplectic_euler(structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+    """:func:`rollout` with the forces of the lattice and symplectic Euler, compiled once and cached."""
+    rollout(
+        lattice_forces,
+        symplectic_euler_step,
+        structure,
+        ground,
+        settings,
+        actuator_length,
+        records,
+        lanes,
+        first,
+        last,
+        progress,
+    )

@@ -1,0 +1,80 @@
+"""Where the robot hops: gravity, slope, ground contact, how long to look, and where a landing is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from tensegrity_gym.errors import InvalidParameterError, UnknownPresetError
+from tensegrity_gym.types import Floats, Ground
+
+LANDINGS = ("rest", "touchdown")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A planet's ground. SI units, angles in radians."""
+
+    gravity: float = 9.80665
+    """Acceleration of gravity [m/s^2]."""
+    slope: float = 0.0
+    """Inclination of the ground [rad]."""
+    slope_direction: float = 0.0
+    """Azimuth of the downhill direction from +x towards +y [rad]."""
+    friction: float = 0.5
+    """Coulomb friction coefficient mu [-]."""
+    restitution: float = 0.0
+    """Newton's coefficient of restitution e of each point mass on the ground [-]."""
+    duration: float = 3.0
+    """Longest time that a hop is simulated after its release [s]."""
+    landing: str = "rest"
+    """Where ``landing`` is read: "rest" (hop over) or "touchdown" (first impact after flight)."""
+
+    PRESETS: ClassVar[dict[str, dict[str, float]]] = {
+        "earth": {"gravity": 9.80665, "duration": 3.0},
+        "moon": {"gravity": 1.625, "duration": 12.0},
+        "mars": {"gravity": 3.7208, "duration": 6.0},
+        "titan": {"gravity": 1.352, "duration": 14.0},
+        "slope": {"gravity": 9.80665, "slope": float(np.radians(10.0)), "friction": 0.7, "duration": 3.0},
+    }
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "gravity": (0.0, 1e3),
+            "slope": (0.0, np.pi / 2),
+            "slope_direction": (-2 * np.pi, 2 * np.pi),
+            "friction": (0.0, 1e3),
+            "restitution": (0.0, 1.0),
+            "duration": (0.0, 1e4),
+        }
+        for name, (low, high) in bounds.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not low <= value <= high:
+                raise InvalidParameterError(f"Scene.{name}: expected a number in [{low:g}, {high:g}], got {value!r}")
+        if self.gravity == 0 or self.duration == 0:
+            raise InvalidParameterError("Scene.gravity and Scene.duration: expected > 0, got 0; nothing would ever land")
+        if self.landing not in LANDINGS:
+            raise InvalidParameterError(f"Scene.landing: expected one of {LANDINGS}, got {self.landing!r}")
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> Scene:
+        """A named scene: one of ``Scene.PRESETS``, with fields changed by keyword.
+
+        Raises UnknownPresetError for a name that is not there.
+        """
+        if name not in cls.PRESETS:
+            raise UnknownPresetError(f"Scene.preset: expected one of {sorted(cls.PRESETS)}, got {name!r}")
+        return replace(cls(**cls.PRESETS[name]), **changes)  # type: ignore[arg-type]
+
+    @property
+    def gravity_vector(self) -> Floats:
+        """Gravity in the frame of the ground, whose normal is +z, shape (3,) [m/s^2]."""
+        downhill = np.array((np.cos(self.slope_direction), np.sin(self.slope_direction), 0.0))
+        return self.gravity * (np.sin(self.slope) * downhill - np.cos(self.slope) * np.array((0.0, 0.0, 1.0)))
+
+    @property
+    def ground(self) -> Ground:
+        """What the kernels need of the scene."""
+        return Ground(self.gravity_vector, float(self.friction), float(self.restitution))

@@ -1,0 +1,262 @@
+"""Hops: find the equilibrium, unlock the actuators, roll out, report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tensegrity_gym.batch import Progress, run_shares
+from tensegrity_gym.core import rollout as kernel
+from tensegrity_gym.core.lanes import lane_count, lanes_empty
+from tensegrity_gym.design import Design
+from tensegrity_gym.energies import centre_of_mass, elastic_energies, gravitational_energy, kinetic_energy
+from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.formfinding import Equilibria, form_find
+from tensegrity_gym.lattice import Lattice
+from tensegrity_gym.scene import Scene
+from tensegrity_gym.timestep import default_time_step
+from tensegrity_gym.types import ENERGY_NAMES, Floats, HopStatus, Structure
+from tensegrity_gym.version import MODEL_VERSION
+
+#: Steps between two looks at rest, blow-up and frames.
+STRIDE = 32
+#: A lattice on the ground is quiet below this kinetic energy, over (total mass) g l.
+REST_ENERGY = 1e-5
+#: It is at rest when quiet for this share of sqrt(l / g).
+REST_TIME = 0.4
+#: Hops rolled out at once: bounds the memory for events to about 35 KB a hop.
+CHUNK = 512
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Frames of hops; those past ``frames[i]`` are zero."""
+
+    times: Floats  #: since release [s], shape (n, n_frames)
+    positions: Floats  #: [m], shape (n, n_frames, n_masses, 3)
+    energies: Floats  #: [J], columns ENERGY_NAMES, shape (n, n_frames, 7)
+    frames: np.ndarray  #: valid frames, shape (n,)
+
+
+@dataclass(frozen=True)
+class HopResult:
+    """A batch of hops; arrays are batch first. Displacements are horizontal, from the start of the hop."""
+
+    stretches: Floats  #: lambda [-], shape (n, n_actuators)
+    landing: Floats  #: displacement of the centre of mass, where ``scene.landing`` says [m], shape (n, 2)
+    rest: Floats  #: at the end of the hop [m], shape (n, 2)
+    touchdown: Floats  #: at the first impact after flight [m], shape (n, 2)
+    rest_nodes: Floats  #: displacement of the mean of the nodes at the end (the paper's) [m], shape (n, 2)
+    touchdown_nodes: Floats  #: likewise at touchdown [m], shape (n, 2)
+    apex: Floats  #: highest rise of the centre of mass above its start [m], shape (n,)
+    takeoff_time: Floats  #: since release [s], shape (n,)
+    takeoff_velocity: Floats  #: of the centre of mass [m/s], shape (n, 3)
+    touchdown_time: Floats  #: since release [s], shape (n,)
+    flight_time: Floats  #: from take-off to touchdown, 0 without flight [s], shape (n,)
+    end_time: Floats  #: since release [s], shape (n,)
+    status: np.ndarray  #: HopStatus, shape (n,)
+    energies: Floats  #: at release, take-off, touchdown, end [J], columns ENERGY_NAMES, shape (n, 4, 7)
+    stored_energy: Floats  #: elastic energy at release, in the locked lattice [J], shape (n,)
+    equilibria: Equilibria  #: what the hops started from
+    dt: float  #: time step [s]
+    steps: np.ndarray  #: steps taken, shape (n,)
+    trajectory: Trajectory | None  #: frames, if asked for
+    model_version: str = MODEL_VERSION  #: version of the physics
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Hops whose landing is no answer (unstable or never started), shape (n,)."""
+        return self.status >= HopStatus.UNSTABLE
+
+
+def simulate(
+    stretches: ArrayLike,
+    *,
+    design: Design | None = None,
+    scene: Scene | None = None,
+    lattice: Lattice | None = None,
+    dt: float | None = None,
+    trajectory_rate: float | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+    equilibria: Equilibria | None = None,
+) -> HopResult:
+    """Hops of the lattice from the equilibria of ``stretches``, (n_actuators,) or (n, n_actuators).
+
+    All actuators are unlocked at once at time 0 and the hop is followed to rest, at most for ``scene.duration``. ``dt`` [s]
+    defaults to 0.8 of the critical step; ``trajectory_rate`` [Hz] asks for frames; ``equilibria`` saves finding them again.
+    ``progress`` is called with the number of hops newly ended. A hop that fails says so in ``status``, its neighbours go on.
+
+    Raises InvalidStretchesError and InvalidParameterError.
+    """
+    design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
+    if equilibria is None:
+        equilibria = form_find(stretches, design=design, scene=scene, lattice=lattice, threads=threads)
+    step = default_time_step(design, lattice) if dt is None else _positive("dt", dt)
+    rate = 0.0 if trajectory_rate is None else _positive("trajectory_rate", trajectory_rate)
+    structure = design.structure(lattice)
+    settings = _settings(structure, equilibria, scene, design, step, rate)
+    parts = []
+    for first in range(0, len(equilibria.stretches), CHUNK):
+        chunk = slice(first, first + CHUNK)
+        records = _records(equilibria.positions[chunk], equilibria.converged[chunk], settings)
+        _roll_out(structure, scene, settings, records, threads, progress)
+        parts.append(_measure(records, structure, scene, lattice, step))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    frames = Trajectory(**{k[6:]: columns.pop(k) for k in list(columns) if k.startswith("frame_")})
+    return HopResult(
+        stretches=equilibria.stretches,
+        landing=columns[scene.landing].copy(),
+        stored_energy=equilibria.stored_energy,
+        equilibria=equilibria,
+        dt=step,
+        trajectory=frames if rate else None,
+        **columns,
+    )
+
+
+def _positive(name: str, value: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not np.isfinite(value) or value <= 0:
+        raise InvalidParameterError(f"simulate: expected {name} to be a finite number > 0, got {value!r}")
+    return float(value)
+
+
+def _settings(
+    structure: Structure, equilibria: Equilibria, scene: Scene, design: Design, dt: float, rate: float
+) -> kernel.HopSettings:
+    weight_height = structure.mass.sum() * scene.gravity * design.cell_height
+    blocks = int(np.ceil(scene.duration / dt / STRIDE))
+    stored = float(np.max(equilibria.stored_energy, initial=0.0))
+    return kernel.HopSettings(
+        dt=dt,
+        max_steps=blocks * STRIDE,
+        stride=STRIDE,
+        rest_energy=REST_ENERGY * weight_height,
+        rest_steps=int(np.ceil(REST_TIME * np.sqrt(design.cell_height / scene.gravity) / dt)),
+        # whatever the bars give back, kinetic energy stays below it plus the fall; ten times that is no physics
+        runaway_energy=10.0 * (stored + weight_height + structure.mass.sum() * scene.gravity**2 * scene.duration**2),
+        frame_stride=max(1, round(1.0 / (rate * dt * STRIDE))) * STRIDE if rate else 0,
+    )
+
+
+def _records(positions: Floats, converged: np.ndarray, settings: kernel.HopSettings) -> kernel.HopRecords:
+    n, m = positions.shape[:2]
+    frames = settings.max_steps // settings.frame_stride if settings.frame_stride else 0
+    state = np.zeros((n, 4, 2, m, 3))
+    state[:, kernel.RELEASE, 0] = positions
+    return kernel.HopRecords(
+        state=state,
+        time=np.zeros((n, 4)),
+        dissipated=np.zeros((n, 4, 2)),
+        touchdown_shift=np.zeros(n),
+        height=np.zeros(n),
+        steps=np.zeros(n, dtype=np.int64),
+        status=np.where(converged, -1, int(HopStatus.NOT_CONVERGED)),
+        frame_positions=np.zeros((n, frames, m, 3)),
+        frame_times=np.zeros((n, frames)),
+        frame_energies=np.zeros((n, frames, len(ENERGY_NAMES))),
+        frame_count=np.zeros(n, dtype=np.int64),
+    )
+
+
+def hop_lanes(structure: Structure) -> kernel.LaneState:
+    """Work arrays of one thread."""
+    count = lane_count(np.float64)
+    return kernel.LaneState(
+        *(lanes_empty((len(structure.mass), 3)) for _ in range(3)),
+        lanes_empty((structure.n_axial_members,)),
+        lanes_empty((len(structure.mass), 3)),
+        lanes_empty((len(structure.actuators),)),
+        lanes_empty((kernel.N_SCALARS,)),
+        *(np.zeros(count, dtype=np.int64) for _ in range(3)),
+        np.zeros(count, dtype=np.bool_),
+    )
+
+
+def _roll_out(
+    structure: Structure,
+    scene: Scene,
+    settings: kernel.HopSettings,
+    records: kernel.HopRecords,
+    threads: int | None,
+    progress: Progress | None,
+) -> None:
+    n = len(records.status)
+
+    def work(first: int, last: int, counter: np.ndarray) -> None:
+        kernel.rollout_symplectic_euler(
+            structure,
+            scene.ground,
+            settings,
+            structure.actuator_length,
+            records,
+            hop_lanes(structure),
+            first,
+            last,
+            counter,
+        )
+
+    run_shares(work, n, threads, lane_count(np.float64), progress)
+
+
+def _measure(
+    records: kernel.HopRecords, structure: Structure, scene: Scene, lattice: Lattice, dt: float
+) -> dict[str, np.ndarray]:
+    """What the events say: displacements, speeds, times and energies of a chunk of hops."""
+    centre = centre_of_mass(structure, records.state)  # (n, 4, 2, 3)
+    nodes = records.state[:, :, :, : lattice.n_nodes].mean(axis=3)
+    start, end = kernel.RELEASE, kernel.END
+    shift = records.touchdown_shift[:, None]
+    flew = records.status <= HopStatus.TIME_LIMIT
+
+    def touchdown(mean: Floats) -> Floats:
+        at = mean[:, kernel.TOUCHDOWN, 0, :2] + shift * mean[:, kernel.TOUCHDOWN, 1, :2]
+        return at - mean[:, start, 0, :2]
+
+    touchdown_time = records.time[:, kernel.TOUCHDOWN] + records.touchdown_shift
+    takeoff_time = records.time[:, kernel.TAKEOFF]
+    takeoff_velocity = np.where(flew[:, None], centre[:, kernel.TAKEOFF, 1], 0.0)
+    normal_gravity = -scene.gravity_vector[2]
+    ballistic = centre[:, kernel.TAKEOFF, 0, 2] + takeoff_velocity[:, 2] ** 2 / (2 * normal_gravity)
+    apex = np.where(flew, ballistic, np.maximum(records.height, centre[:, start, 0, 2])) - centre[:, start, 0, 2]
+    return {
+        "rest": centre[:, end, 0, :2] - centre[:, start, 0, :2],
+        "touchdown": touchdown(centre),
+        "rest_nodes": nodes[:, end, 0, :2] - nodes[:, start, 0, :2],
+        "touchdown_nodes": touchdown(nodes),
+        "apex": apex,
+        "takeoff_time": takeoff_time,
+        "takeoff_velocity": takeoff_velocity,
+        "touchdown_time": touchdown_time,
+        "flight_time": np.where(flew, touchdown_time - takeoff_time, 0.0),
+        "end_time": records.time[:, end],
+        "status": records.status,
+        "steps": records.steps,
+        "energies": _event_energies(records, structure, scene, dt),
+        "frame_times": records.frame_times,
+        "frame_positions": records.frame_positions,
+        "frame_energies": records.frame_energies,
+        "frame_frames": records.frame_count,
+    }
+
+
+def _event_energies(records: kernel.HopRecords, structure: Structure, scene: Scene, dt: float) -> Floats:
+    """Energies at the four events [J], columns ENERGY_NAMES, shape (n, 4, 7).
+
+    Potential energies are means over the two ends of the step in whose middle the event's state is, as in the kernel.
+    """
+    n = len(records.status)
+    energies = np.zeros((n, 4, len(ENERGY_NAMES)))
+    lengths = np.broadcast_to(structure.actuator_length, (n, len(structure.actuator_length)))
+    for event in range(4):
+        positions, velocities = records.state[:, event, 0], records.state[:, event, 1]
+        for end in (positions - 0.5 * dt * velocities, positions + 0.5 * dt * velocities):
+            parts = elastic_energies(structure, end, lengths)
+            parts["gravitational"] = gravitational_energy(structure, scene.gravity_vector, end)
+            for name, values in parts.items():
+                energies[:, event, ENERGY_NAMES.index(name)] += 0.5 * values
+        energies[:, event, ENERGY_NAMES.index("kinetic")] = kinetic_energy(structure, velocities)
+    energies[:, :, 5:] = records.dissipated
+    return energies
