@@ -25,7 +25,7 @@ TAUT, SLACK, NODE, INK, TRAIL, TARGET = (
     (200, 30, 80),
 )
 #: Bow (largest distance from the chord over length) from which a bar is drawn fully red [-].
-FULL_BOW = 0.2
+FULL_BOW = 0.15
 #: Drawn thicknesses [m]; members are drawn thicker than they are, to be seen.
 BAR_WIDTH, CABLE_WIDTH, ACTUATOR_WIDTH, NODE_RADIUS = 0.014, 0.005, 0.012, 0.011
 #: Where the light comes from: horizontal displacement of a shadow per height [-].

@@ -66,8 +66,8 @@ def filmstrip(
 ) -> np.ndarray:
     """One wide picture of a hop: ``moments`` postures side by side, with the path of the centre of mass between them.
 
-    ``hop`` picks one out of the trajectory's batch; ``target`` [m], shape (2,), is relative to the start. Postures are
-    moved apart to the right; nothing else is changed.
+    ``hop`` picks one out of the trajectory's batch; ``target`` [m], shape (2,), is relative to the start. Each posture is
+    moved, not turned, to the middle of its column; how far the hop got by then is written below it.
     Returns shape (h, w, 3), uint8.
     """
     structure = _structure(lattice or Lattice(2, 2), design or Design())
@@ -86,20 +86,22 @@ def filmstrip(
     camera = replace(camera, width=width, centre=(0.0, 0.0, (top - 0.3) / 2))
     right = camera.axes[0]
     columns = ((np.arange(len(shown)) + 0.5) / len(shown) - 0.5) * (width - 0.5)
-    offsets = columns[:, None] * right - com[0] * (1, 1, 0)
+    flat = com * (1, 1, 0)
+    offsets = columns[:, None] * right - flat[shown]
 
     canvas = Canvas(size, camera)
     if target is not None:
-        canvas.target(np.append(target, 0.0) + offsets[-1])
+        canvas.target(flat[0] + np.append(target, 0.0) + offsets[-1])
     for frame, offset in zip(shown, offsets, strict=True):
         canvas.shadow(points[frame] + offset, structure)
-    moved = np.column_stack([np.interp(times, times[shown], offsets[:, k]) for k in range(3)])
-    canvas.trail((com + moved)[shown[0] : shown[-1] + 1])
+    across = np.interp(times, times[shown], columns)
+    canvas.trail(((com - flat) + across[:, None] * right)[shown[0] : shown[-1] + 1])
     for k, (frame, offset) in enumerate(zip(shown, offsets, strict=True)):
         canvas.lattice(points[frame] + offset, structure, _held_lengths(points[0], structure) if frame == 0 else None)
-        across = 0.5 + columns[k] / width
-        canvas.text((across, 0.875), f"{times[frame]:.2f} s", height=max(size[1] // 24, 9))
-        canvas.text((across, 0.93), named[frame], height=max(size[1] // 30, 8), colour=TRAIL)
+        middle, gone = 0.5 + columns[k] / width, np.linalg.norm(flat[frame] - flat[0])
+        canvas.text((middle, 0.875), f"{times[frame]:.2f} s", height=max(size[1] // 24, 9))
+        said = f"{named[frame]}, {gone:.2f} m away" if named[frame] in ("touchdown", "end") else named[frame]
+        canvas.text((middle, 0.93), said, height=max(size[1] // 30, 8), colour=TRAIL)
     return canvas.array()
 
 

@@ -43,7 +43,11 @@ class Reach:
 #: Measured reaches of the default design's 2x2 lattice, by preset and by where the landing is read; made by
 #: ``python -m tensegrity_gym reach --scene NAME --hops 256``.
 REACHES: dict[str, dict[str, Reach]] = {
-    name: {"rest": Reach(0.5), "touchdown": Reach(0.1)} for name in ("earth", "moon", "mars", "titan", "slope")
+    "earth": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
+    "moon": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
+    "mars": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
+    "titan": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
+    "slope": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
 }
 
 _FAILED = (int(HopStatus.UNSTABLE), int(HopStatus.NOT_CONVERGED))

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from tensegrity_gym import Design, Lattice, Scene, simulate
-from tensegrity_gym.canvas import FULL_BOW, Camera, bar_bow, bar_curves
+from tensegrity_gym.canvas import FULL_BOW, LIGHT, Camera, bar_bow, bar_curves
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.render import choose_moments, draw_posture, filmstrip, record_hop, watching_camera
 from tensegrity_gym.simulate import HopResult
@@ -42,9 +42,11 @@ def test_the_lattice_is_seen_where_the_camera_projects_it(standing: np.ndarray) 
     empty = draw_posture(standing + (0, 0, 50), size=size).astype(int)
     seen = np.abs(draw_posture(standing, size=size).astype(int) - empty).sum(axis=2) > 60
     pixels, _ = Camera().project(standing, size)
+    shadow, _ = Camera().project(standing - standing[:, 2:] * (*LIGHT, 1.0), size)
+    x = np.concatenate([pixels, shadow])[:, 0]
     columns = np.nonzero(seen.any(axis=0))[0]
-    assert columns.min() >= pixels[:, 0].min() - 5
-    assert columns.max() <= pixels[:, 0].max() + 5 + 0.35 * size[0] / Camera().width  # the shadow falls to one side
+    assert columns.min() >= x.min() - 8  # the shadow is blurred
+    assert columns.max() <= x.max() + 8
     for x, y in pixels[: LATTICE.n_nodes].astype(int):
         assert seen[y - 2 : y + 3, x - 2 : x + 3].any()
 
