@@ -80,10 +80,8 @@ def filmstrip(
     shown = np.array(sorted(named))
     com = _centre_of_mass(points, structure)
 
-    top = float(points[..., 2].max())
-    camera = Camera(azimuth=np.radians(-75.0), distance=np.inf)
-    width = max(1.5 * len(shown) + 0.5, (top + 1.25) * size[0] / size[1])
-    camera = replace(camera, width=width, centre=(0.0, 0.0, (top - 0.3) / 2))
+    camera = _strip_camera(float(points[..., 2].max()), len(shown), size)
+    width = camera.width
     right = camera.axes[0]
     columns = ((np.arange(len(shown)) + 0.5) / len(shown) - 0.5) * (width - 0.5)
     flat = com * (1, 1, 0)
@@ -103,6 +101,16 @@ def filmstrip(
         said = f"{named[frame]}, {gone:.2f} m away" if named[frame] in ("touchdown", "end") else named[frame]
         canvas.text((middle, 0.93), said, height=max(size[1] // 30, 8), colour=TRAIL)
     return canvas.array()
+
+
+def _strip_camera(top: float, columns: int, size: tuple[int, int]) -> Camera:
+    """A parallel view of ``columns`` postures up to ``top`` [m], the lower sixth of the picture left for words."""
+    camera = Camera(azimuth=np.radians(-75.0), distance=np.inf)
+    deep = 0.2  # what lies nearer than the middle of the lattice appears below it [m]
+    width = max(1.5 * columns + 0.5, (top + 2 * deep) / 0.76 * size[0] / size[1])
+    height = width * size[1] / size[0]
+    centre = (0.33 * height - deep) / np.cos(camera.elevation)
+    return replace(camera, width=width, centre=(0.0, 0.0, float(centre)))
 
 
 def choose_moments(times: Floats, positions: Floats, moments: int) -> dict[int, str]:
