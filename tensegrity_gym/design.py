@@ -220,6 +220,7 @@ class Design:
         hinge = np.full(n_bars, self.hinge_stiffness)
         return Structure(
             mass=mass,
+            inverse_mass=1.0 / mass,
             cables=lattice.cables,
             cable_stiffness=cable_stiffness,
             cable_length=cable_length,

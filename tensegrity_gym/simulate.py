@@ -26,6 +26,8 @@ STRIDE = 32
 REST_ENERGY = 1e-5
 #: It is at rest when quiet for this share of sqrt(l / g).
 REST_TIME = 0.4
+#: A take-off whose ballistic rise is below this share of l is no flight.
+LEAST_RISE = 1e-3
 #: Hops rolled out at once: bounds the memory for events to about 35 KB a hop.
 CHUNK = 512
 
@@ -137,6 +139,7 @@ def _settings(
         rest_steps=int(np.ceil(REST_TIME * np.sqrt(design.cell_height / scene.gravity) / dt)),
         # whatever the bars give back, kinetic energy stays below it plus the fall; ten times that is no physics
         runaway_energy=10.0 * (stored + weight_height + structure.mass.sum() * scene.gravity**2 * scene.duration**2),
+        flight_speed=float(np.sqrt(2 * scene.gravity * LEAST_RISE * design.cell_height)),
         frame_stride=max(1, round(1.0 / (rate * dt * STRIDE))) * STRIDE if rate else 0,
     )
 

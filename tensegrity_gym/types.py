@@ -23,6 +23,7 @@ class Structure(NamedTuple):
     """
 
     mass: Floats  #: [kg], shape (n_masses,)
+    inverse_mass: Floats  #: [1/kg], shape (n_masses,)
     cables: Ints  #: mass indices, shape (n_cables, 2)
     cable_stiffness: Floats  #: EA / natural length [N/m], shape (n_cables,)
     cable_length: Floats  #: natural length [m], shape (n_cables,)

@@ -23,7 +23,7 @@ def symplectic_euler_step(forces, structure, actuator_length, ground, dt, kick, 
     dissipated = power * 0.0
     lowest = load(x, 0, 2) + 1e30
     for i in range(structure.mass.shape[0]):
-        inverse = kick / structure.mass[i]
+        inverse = kick * structure.inverse_mass[i]
         vx, vy, vz = load(v, i, 0), load(v, i, 1), load(v, i, 2)
         px, py, pz = load(x, i, 0), load(x, i, 1), load(x, i, 2)
         ax, ay, az = load(f, i, 0) * inverse, load(f, i, 1) * inverse, load(f, i, 2) * inverse

@@ -28,6 +28,7 @@ class HopSettings(NamedTuple):
     rest_energy: float  #: kinetic energy below which a lattice on the ground counts as quiet [J]
     rest_steps: int  #: how long it must stay quiet [steps]
     runaway_energy: float  #: kinetic energy that no sane hop reaches [J]
+    flight_speed: float  #: vertical speed of the centre of mass from which leaving the ground counts as take-off [m/s]
     frame_stride: int  #: steps between two frames, a multiple of ``stride``; 0 for no frames
 
 
@@ -120,18 +121,21 @@ def vertical_velocity(structure, lanes, lane):
 
 
 @jit(forceinline=False)
-def contact_change(structure, lanes, lane, records, hop, flown, dt, time):
+def contact_change(structure, settings, lanes, lane, records, hop, flown, time):
     """A lane left the ground or came back to it in the last step; returns whether its flight is now behind it.
 
     Take-off is the last departure before touchdown; touchdown the first contact while the centre of mass descends. A foot
-    that still pushes while the body rises is no landing.
+    that still pushes while the body rises is no landing, and a tremble of the standing lattice is no flight.
     """
     if flown:
         return True
+    dt = settings.dt
+    speed = vertical_velocity(structure, lanes, lane)
     if lanes.scalars[AIRBORNE, lane] > 0.0:
-        save_event(lanes, lane, records, hop, TAKEOFF, dt, time)
+        if speed > settings.flight_speed:
+            save_event(lanes, lane, records, hop, TAKEOFF, dt, time)
         return False
-    if records.time[hop, TAKEOFF] <= 0.0 or vertical_velocity(structure, lanes, lane) >= 0.0:
+    if records.time[hop, TAKEOFF] <= 0.0 or speed >= 0.0:
         return False
     save_event(lanes, lane, records, hop, TOUCHDOWN, dt, time)
     before, after = lanes.scalars[WAS_LOWEST, lane], lanes.scalars[LOWEST, lane]
@@ -284,7 +288,7 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
                 for lane in range(count):
                     if hop[lane] >= 0 and lanes.scalars[WAS_AIRBORNE, lane] != lanes.scalars[AIRBORNE, lane]:
                         time = (step[lane] + k + 1) * dt
-                        flown[lane] = contact_change(structure, lanes, lane, records, hop[lane], flown[lane], dt, time)
+                        flown[lane] = contact_change(structure, settings, lanes, lane, records, hop[lane], flown[lane], time)
             store1(lanes.scalars, LOWEST, lowest)
         watch(structure, lanes)
         frames_due = False
