@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
+from tensegrity_gym.core.forces import MAX_SEGMENTS
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.lattice import Lattice, cell_bars, cell_nodes
 from tensegrity_gym.types import Floats, Structure
@@ -127,8 +128,8 @@ class Design:
             if not isinstance(value, (int, float, np.number)) or not np.isfinite(value) or not (value > 0 or (may_be_zero and value == 0)):
                 bound = ">= 0" if may_be_zero else "> 0"
                 raise InvalidParameterError(f"Design.{field.name}: expected a finite number {bound}, got {value!r}")
-        if int(self.bar_segments) != self.bar_segments:
-            raise InvalidParameterError(f"Design.bar_segments: expected an integer >= 1, got {self.bar_segments!r}")
+        if int(self.bar_segments) != self.bar_segments or self.bar_segments > MAX_SEGMENTS:
+            raise InvalidParameterError(f"Design.bar_segments: expected an integer from 1 to {MAX_SEGMENTS}, got {self.bar_segments!r}")
 
     @property
     def cell_height(self) -> float:

@@ -12,7 +12,7 @@ the energy audit is off by percents where a mode turns in few steps.)
 from __future__ import annotations
 
 from tensegrity_gym.core.jit import jit
-from tensegrity_gym.core.lanes import any_lane, fma, load, load1, select, splat, sqrt, store, store1
+from tensegrity_gym.core.lanes import any_lane, fma, load, load1, select, splat, sqrt, stack_rows, store, store1
 from tensegrity_gym.core.members import cable_tension, hinge_damping_factor, hinge_factor
 
 
@@ -45,66 +45,119 @@ def gravity_forces(structure, gravity, f):
             store(f, i, c, splat(structure.mass[i] * gravity[c], like))
 
 
+#: Rows of scratch for the segments of some bars: unit vector, its rate, 1 / length, pull, hinge factor, cosine.
+SEGMENT_ROWS = 10
+SCRATCH_ROWS = 320  # 20 KiB in 8 lanes of float64: stays in the first-level cache
+UNIT, RATE, INVERSE, PULL, HINGE, COSINE = 0, 3, 6, 7, 8, 9
+#: Bars of more segments do not fit into the scratch.
+MAX_SEGMENTS = SCRATCH_ROWS // SEGMENT_ROWS
+
+
 @jit
 def bar_forces(structure, x, v, f, memory):
     """Add the forces of all bars: axial springs, hinges and the damping of both. Returns the power dissipated [W].
 
-    Runs along each bar once with the last segment in registers. Segment j of unit vector u and length l pulls its near end
-    with A = T u + P G / l, P = I - u u^T, and its far end with -A; G is dU/du (with damping) of its two hinges.
+    Some bars at a time go through three stages, each a loop whose turns do not wait for each other: segments, hinges, sums.
     """
-    bars = structure.bars
-    segments = bars.shape[1] - 1
-    zero = load(x, 0, 0) * 0.0
-    power = zero
-    for b in range(bars.shape[0]):
-        stiffness = structure.segment_stiffness[b]
-        natural = structure.segment_length[b]
-        damping = structure.segment_damping[b]
-        kappa = structure.hinge_stiffness[b]
-        hinge_c = structure.hinge_damping[b]
-        # the segment before: unit vector, its rate, 1/length, tension, G so far, and what its near end already carries
-        ux = uy = uz = wx = wy = wz = inverse = tension = gx = gy = gz = cx = cy = cz = zero
-        for j in range(segments):
-            near, far = bars[b, j], bars[b, j + 1]
-            dx, dy, dz = between(x, near, far)
-            ex, ey, ez = between(v, near, far)
-            length = sqrt(dot(dx, dy, dz, dx, dy, dz))
-            inv = 1.0 / length
-            nx, ny, nz = dx * inv, dy * inv, dz * inv
-            rate = dot(nx, ny, nz, ex, ey, ez)
-            drag = damping * rate
-            pull = fma(stiffness, length - natural, drag)
-            power = fma(0.5 * (load1(memory, b * segments + j) + drag), rate, power)
-            store1(memory, b * segments + j, drag)
-            rx, ry, rz = (ex - rate * nx) * inv, (ey - rate * ny) * inv, (ez - rate * nz) * inv
-            hx = hy = hz = zero
-            if j > 0:
-                bx, by, bz = ux - nx, uy - ny, uz - nz
-                s = 0.25 * dot(bx, by, bz, bx, by, bz)
-                closing = dot(bx, by, bz, wx - rx, wy - ry, wz - rz)
-                added, lost = hinge_damping_factor(hinge_c, s, closing)
-                factor = hinge_factor(kappa, s) + added
-                power = power + lost
-                # U depends on u . n with dU = -factor d(u . n)
-                gx, gy, gz = gx - factor * nx, gy - factor * ny, gz - factor * nz
-                hx, hy, hz = -factor * ux, -factor * uy, -factor * uz
-                ax, ay, az = _segment_force(ux, uy, uz, inverse, tension, gx, gy, gz)
-                add_force(f, bars[b, j - 1], ax - cx, ay - cy, az - cz)
-                cx, cy, cz = ax, ay, az
-            ux, uy, uz, wx, wy, wz = nx, ny, nz, rx, ry, rz
-            inverse, tension = inv, pull
-            gx, gy, gz = hx, hy, hz
-        ax, ay, az = _segment_force(ux, uy, uz, inverse, tension, gx, gy, gz)
-        add_force(f, bars[b, segments - 1], ax - cx, ay - cy, az - cz)
-        add_force(f, bars[b, segments], -ax, -ay, -az)
+    segments = structure.bars.shape[1] - 1
+    like = load(x, 0, 0)
+    scratch = stack_rows(SCRATCH_ROWS, like)
+    power = like * 0.0
+    some = max(1, MAX_SEGMENTS // segments)
+    for first in range(0, structure.bars.shape[0], some):
+        last = min(first + some, structure.bars.shape[0])
+        power = power + _segment_stage(structure, x, v, memory, scratch, first, last)
+        power = power + _hinge_stage(structure, scratch, first, last, power)
+        _bar_sum_stage(structure, f, scratch, first, last, power)
     return power
 
 
 @jit
-def _segment_force(ux, uy, uz, inverse, tension, gx, gy, gz):
-    """A = T u + (G - (G . u) u) / l: the force on the near end of a segment."""
-    along = fma(-inverse, dot(gx, gy, gz, ux, uy, uz), tension)
-    return fma(along, ux, gx * inverse), fma(along, uy, gy * inverse), fma(along, uz, gz * inverse)
+def _segment_stage(structure, x, v, memory, scratch, first, last):
+    """Unit vectors, their rates, and axial forces of the segments of some bars; returns the axial damping's power [W]."""
+    segments = structure.bars.shape[1] - 1
+    power = load(x, 0, 0) * 0.0
+    row = 0
+    for b in range(first, last):
+        for j in range(segments):
+            near, far = structure.bars[b, j], structure.bars[b, j + 1]
+            dx, dy, dz = between(x, near, far)
+            ex, ey, ez = between(v, near, far)
+            length = sqrt(dot(dx, dy, dz, dx, dy, dz))
+            inverse = 1.0 / length
+            nx, ny, nz = dx * inverse, dy * inverse, dz * inverse
+            rate = dot(nx, ny, nz, ex, ey, ez)
+            drag = structure.segment_damping[b] * rate
+            member = b * segments + j
+            power = fma(0.5 * (load1(memory, member) + drag), rate, power)
+            store1(memory, member, drag)
+            store1(scratch, row + UNIT, nx)
+            store1(scratch, row + UNIT + 1, ny)
+            store1(scratch, row + UNIT + 2, nz)
+            store1(scratch, row + RATE, fma(-rate, nx, ex) * inverse)
+            store1(scratch, row + RATE + 1, fma(-rate, ny, ey) * inverse)
+            store1(scratch, row + RATE + 2, fma(-rate, nz, ez) * inverse)
+            store1(scratch, row + INVERSE, inverse)
+            store1(scratch, row + PULL, fma(structure.segment_stiffness[b], length - structure.segment_length[b], drag))
+            row += SEGMENT_ROWS
+    return power
+
+
+@jit
+def _hinge_stage(structure, scratch, first, last, like):
+    """The factor of d(u . n) and the cosine u . n of the hinges of some bars; returns the bending damping's power [W]."""
+    segments = structure.bars.shape[1] - 1
+    power = like * 0.0
+    row = 0
+    for b in range(first, last):
+        for _ in range(segments - 1):
+            after = row + SEGMENT_ROWS
+            bx = load1(scratch, row + UNIT) - load1(scratch, after + UNIT)
+            by = load1(scratch, row + UNIT + 1) - load1(scratch, after + UNIT + 1)
+            bz = load1(scratch, row + UNIT + 2) - load1(scratch, after + UNIT + 2)
+            wx = load1(scratch, row + RATE) - load1(scratch, after + RATE)
+            wy = load1(scratch, row + RATE + 1) - load1(scratch, after + RATE + 1)
+            wz = load1(scratch, row + RATE + 2) - load1(scratch, after + RATE + 2)
+            s = 0.25 * dot(bx, by, bz, bx, by, bz)
+            added, lost = hinge_damping_factor(structure.hinge_damping[b], s, dot(bx, by, bz, wx, wy, wz))
+            power = power + lost
+            store1(scratch, row + HINGE, hinge_factor(structure.hinge_stiffness[b], s) + added)
+            store1(scratch, row + COSINE, fma(-2.0, s, 1.0))
+            row += SEGMENT_ROWS
+        row += SEGMENT_ROWS
+    return power
+
+
+@jit
+def _bar_sum_stage(structure, f, scratch, first, last, like):
+    """Add what the segments of some bars do to their masses.
+
+    Segment j, of unit vector n and length l, pulls its near end with A = T n + (G - (G . n) n) / l and its far end with -A;
+    G = dU/dn (damping in it) = -sum over its two hinges of (factor) x (the neighbour's unit vector).
+    """
+    segments = structure.bars.shape[1] - 1
+    zero = like * 0.0
+    row = 0
+    for b in range(first, last):
+        px = py = pz = ux = uy = uz = factor = cosine = zero  # of the segment before: A, unit vector; of the hinge before
+        for j in range(segments):
+            nx, ny, nz = load1(scratch, row + UNIT), load1(scratch, row + UNIT + 1), load1(scratch, row + UNIT + 2)
+            hx, hy, hz, along = factor * ux, factor * uy, factor * uz, factor * cosine  # -G and -G . n
+            if j < segments - 1:
+                after = row + SEGMENT_ROWS
+                factor, cosine = load1(scratch, row + HINGE), load1(scratch, row + COSINE)
+                hx = fma(factor, load1(scratch, after + UNIT), hx)
+                hy = fma(factor, load1(scratch, after + UNIT + 1), hy)
+                hz = fma(factor, load1(scratch, after + UNIT + 2), hz)
+                along = fma(factor, cosine, along)
+            inverse = load1(scratch, row + INVERSE)
+            along = fma(inverse, along, load1(scratch, row + PULL))
+            ax, ay, az = fma(along, nx, -(hx * inverse)), fma(along, ny, -(hy * inverse)), fma(along, nz, -(hz * inverse))
+            add_force(f, structure.bars[b, j], ax - px, ay - py, az - pz)
+            px, py, pz = ax, ay, az
+            ux, uy, uz = nx, ny, nz
+            row += SEGMENT_ROWS
+        add_force(f, structure.bars[b, segments], -px, -py, -pz)
 
 
 @jit

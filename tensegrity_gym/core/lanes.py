@@ -20,6 +20,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.np.arrayobj import populate_array
 
 VECTOR_BITS = 512
 
@@ -314,6 +315,38 @@ def splat(typingctx: Any, number: Any, like: Any) -> Any:
         return _to_lanes(context, builder, args[0], sig.args[0], sig.return_type)
 
     return signature(like, number, like), generate
+
+
+@intrinsic
+def stack_rows(typingctx: Any, rows: Any, like: Any) -> Any:
+    """Uninitialised scratch array of ``rows`` (a literal) numbers of the type of ``like``, on the stack of the kernel.
+
+    It lives until the compiled entry point returns; ask once, outside loops.
+    """
+    if not isinstance(rows, types.IntegerLiteral):
+        return None
+    count = rows.literal_value
+    lanes = isinstance(like, LanesType)
+    dtype = like.dtype if lanes else like
+    array_type = types.Array(dtype, 2 if lanes else 1, "C")
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        element = _llvm_lanes(like) if lanes else _llvm_float(like)
+        size = dtype.bitwidth // 8
+        width = like.count if lanes else 1
+        data = cgutils.alloca_once(builder, element, size=count)
+        array = context.make_array(array_type)(context, builder)
+        populate_array(
+            array,
+            data=builder.bitcast(data, _llvm_float(dtype).as_pointer()),
+            shape=[ir.Constant(ir.IntType(64), n) for n in ((count, width) if lanes else (count,))],
+            strides=[ir.Constant(ir.IntType(64), n) for n in ((width * size, size) if lanes else (size,))],
+            itemsize=ir.Constant(ir.IntType(64), size),
+            meminfo=None,
+        )
+        return array._getvalue()
+
+    return signature(array_type, rows, like), generate
 
 
 def lanes_empty(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
