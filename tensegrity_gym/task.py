@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -44,10 +45,10 @@ class Reach:
 #: ``python -m tensegrity_gym reach --scene NAME --hops 256``.
 REACHES: dict[str, dict[str, Reach]] = {
     "earth": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
-    "moon": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
-    "mars": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
-    "titan": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
-    "slope": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
+    "moon": {"rest": Reach(11.140), "touchdown": Reach(1.111)},
+    "mars": {"rest": Reach(5.454), "touchdown": Reach(0.491)},
+    "titan": {"rest": Reach(13.096), "touchdown": Reach(1.335)},
+    "slope": {"rest": Reach(3.422, downhill=1.705), "touchdown": Reach(0.383, downhill=0.461)},
 }
 
 _FAILED = (int(HopStatus.UNSTABLE), int(HopStatus.NOT_CONVERGED))
@@ -153,6 +154,11 @@ class SceneRanges:
         pairs = np.array([self.ranges[name] for name in self.observed], dtype=np.float64).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 
+    def corners(self) -> list[Scene]:
+        """The scenes whose randomised values are all at one end of their range; reaches are widest in one of them."""
+        ends = product(*(self.ranges[name] for name in self.observed))
+        return [self._with(dict(zip(self.observed, values, strict=True))) for values in ends]
+
     def sample(self, rng: np.random.Generator) -> Scene:
         """One scene."""
         if not self.ranges:
@@ -192,8 +198,7 @@ def scene_ranges(scene: str | Scene | SceneRanges | Mapping[str, Any], landing: 
 def observation_bounds(scenes: SceneRanges) -> tuple[Floats, Floats]:
     """Least and greatest observation, shapes (2 + k,): target x, y [m], then what is randomised."""
     low, high = scenes.bounds()
-    # reach changes by preset, not evenly between the corners: take the widest disc of any
-    reaches = [r[scenes.base.landing] for r in REACHES.values()]
+    reaches = [reach_of(corner) for corner in scenes.corners()]
     far = max(r.downhill + TARGET_LIMIT * r.radius for r in reaches)
     return np.concatenate([[-far, -far], low]), np.concatenate([[far, far], high])
 

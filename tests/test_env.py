@@ -160,6 +160,12 @@ def test_targets_fill_the_reachable_disc_evenly() -> None:
     assert np.linalg.norm(targets.mean(axis=0)) < 4 * task.reach(scene) / 2 / np.sqrt(4000)
 
 
+@pytest.mark.parametrize("scene", ["earth", "slope", {"gravity": (1.3, 9.8)}, {"slope": (0.0, 0.2)}], ids=str)
+def test_targets_lie_within_the_observation_space(scene: Any) -> None:
+    env = TensegrityHopEnv(scene=scene)
+    assert all(env.observation_space.contains(env.reset(seed=seed)[0]) for seed in range(200))
+
+
 def test_pictures_before_and_after_the_hop() -> None:
     env = TensegrityHopEnv(scene=SHORT, render_mode="rgb_array")
     env.reset(seed=0)
