@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -70,6 +72,17 @@ def scene_symmetries(lattice: Lattice, scene: Scene) -> tuple[np.ndarray, np.nda
     horizontal = scene.gravity_vector[:2]
     keep = np.abs(lattice.symmetry_signs * horizontal - horizontal).max(axis=1) < 1e-12 * scene.gravity
     return lattice.symmetries[keep], lattice.symmetry_signs[keep]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep torch on one thread: nets this small lose more by waiting for each other's threads than they gain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class HopNet(nn.Module):

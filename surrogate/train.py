@@ -17,7 +17,7 @@ from tqdm import tqdm
 from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.evaluate import rmse
-from surrogate.model import HopNet, NetConfig
+from surrogate.model import HopNet, NetConfig, one_thread
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import InvalidParameterError
 
@@ -56,6 +56,7 @@ class TrainCommand(TrainConfig):
     """Checkpoint to write; its card goes beside it as .json."""
 
 
+@one_thread()
 def train(data: HopData, config: TrainConfig, *, progress: bool = True, desc: str = "surrogate") -> tuple[HopNet, dict[str, Any]]:
     """Train on the usable hops of ``data``; returns the net with the least validation error and its card."""
     started = time.perf_counter()

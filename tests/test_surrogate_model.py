@@ -61,7 +61,7 @@ def test_net_is_equivariant_to_rounding_whatever_its_weights(scene: str) -> None
 def test_simulator_has_the_symmetry_that_is_built_into_the_net() -> None:
     """Image hops start from mirrored equilibria, so they may differ by form-finding's residual, amplified in flight."""
     stretches = np.array((0.3, 0.42, 0.55, 0.36))
-    result = simulate(stretches[LATTICE.symmetries], scene=Scene(duration=0.4))
+    result = simulate(stretches[LATTICE.symmetries], scene=Scene(duration=1.0))
     for g, signs in enumerate(LATTICE.symmetry_signs):
         # the lattice with stretches s moves as the image of the one with s[perm]; up to take-off nothing amplifies
         velocity = result.takeoff_velocity[g] * (*signs, 1)

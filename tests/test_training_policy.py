@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import InvalidParameterError
 from training import train_policy as module
-from training.train_policy import PolicyConfig, ThreadedVecEnv, make_env, train_policy
+from training.sb3_vec_env import BatchedHopVecEnv, make_env
+from training.train_policy import PolicyConfig, train_policy
 
 QUICK = Scene(duration=0.05)
 
@@ -16,7 +18,7 @@ QUICK = Scene(duration=0.05)
 def test_spends_its_budget_exactly_and_keeps_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = {}
     monkeypatch.setattr(module, "SAC", lambda *a, **k: seen.setdefault("model", _sac(*a, **k)))
-    actors, card = train_policy(QUICK, PolicyConfig(calls=8, gradient_steps=1, warmup=0.25), budgets=[4], progress=False)
+    actors, card = train_policy(QUICK, PolicyConfig(calls=8, gradient_steps=1, warmup=0.25, envs=3), budgets=[4], progress=False)
     assert card["simulator_calls"] == 8
     assert sorted(actors) == [4, 8]
     # the copy answers as stable-baselines3 does, rescaled from [-1, 1] to stretches
@@ -32,19 +34,22 @@ def _sac(*args, **options):
     return SAC(*args, **options)
 
 
-def test_threads_give_what_one_after_the_other_gives() -> None:
-    from stable_baselines3.common.vec_env import DummyVecEnv
-
+def test_batched_envs_give_what_the_registered_env_gives_one_after_the_other() -> None:
+    plain = DummyVecEnv([lambda: make_env(QUICK, 0.5)] * 3)
+    batched = BatchedHopVecEnv(QUICK, 0.5, 3)
     steps = []
-    for kind in (DummyVecEnv, ThreadedVecEnv):
-        venv = kind([lambda: make_env(QUICK, 0.5)] * 2)
+    for venv in (plain, batched):
         venv.seed(5)
         first = venv.reset()
-        after, rewards, dones, infos = venv.step(np.array([(-0.5, 0.0, 0.5, 1.0), (0.1, -1.0, 0.2, 0.3)], dtype=np.float32))
-        steps.append((first, after, rewards, dones, [i["landing"] for i in infos], [i["terminal_observation"] for i in infos]))
+        for action in (np.linspace(-1, 1, 12), np.linspace(0.5, -1, 12)):
+            after, rewards, dones, infos = venv.step(action.reshape(3, 4).astype(np.float32))
+            shown = [[info[k] for info in infos] for k in ("landing", "error", "status", "terminal_observation")]
+            steps.append((first, after, rewards, dones, *shown))
         venv.close()
-    for plain, threaded in zip(*steps, strict=True):
-        assert np.array_equal(plain, threaded)
+    for theirs, ours in zip(steps[:2], steps[2:], strict=True):
+        for one, other in zip(theirs, ours, strict=True):
+            assert np.array_equal(one, other)
+    assert batched.simulator_calls == 6
 
 
 def test_budgets_beyond_the_calls_are_refused() -> None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from surrogate.generate import sample_stretches
+from surrogate.model import one_thread
 from tensegrity_gym import STRETCH_RANGE
 from tensegrity_gym.errors import InvalidParameterError
 
@@ -96,6 +97,7 @@ class InversePlanner:
         stretches, _ = self.plan(targets_of(observation))
         return (stretches[0] if np.ndim(observation) == 1 else stretches), state
 
+    @one_thread()
     def plan(self, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Targets (n, 2) [m] to stretches (n, n_actuators) and the expected landing error (rms) of each, (n,) [m]."""
         goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))[:, None]  # (n, 1, 2)

@@ -10,6 +10,8 @@ import numpy as np
 from tensegrity_gym import Design, HopStatus, Lattice, Scene, simulate
 from training.planner import Planner
 
+FIELDS = ("stretches", "landings", "errors", "failed")
+
 
 @dataclass(frozen=True)
 class Score:
@@ -36,18 +38,24 @@ class Score:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-like content."""
-        return {
-            "stretches": self.stretches.tolist(),
-            "landings": self.landings.tolist(),
-            "errors": self.errors.tolist(),
-            "failed": self.failed.tolist(),
-        }
+        return {name: getattr(self, name).tolist() for name in FIELDS}
+
+    def divided(self, parts: int) -> list[Score]:
+        """Equal parts, in order."""
+        columns = [np.split(getattr(self, name), parts) for name in FIELDS]
+        return [Score(*part) for part in zip(*columns, strict=True)]
+
+    @classmethod
+    def of_landings(cls, stretches: Any, landings: Any, targets: np.ndarray) -> Score:
+        """Score of hops that are known to have landed at ``landings`` (n, 2) [m]."""
+        landings = np.asarray(landings, dtype=np.float64)
+        errors = np.linalg.norm(landings - targets, axis=1)
+        return cls(np.asarray(stretches, dtype=np.float64), landings, errors, np.zeros(len(landings), dtype=bool))
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> Score:
         """Inverse of :meth:`as_dict`."""
-        kept = {name: np.array(content[name]) for name in ("stretches", "landings", "errors", "failed")}
-        return cls(**kept)
+        return cls(*(np.array(content[name]) for name in FIELDS))
 
 
 def score(

@@ -5,24 +5,24 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
 import tensegrity_gym  # noqa: F401  registers the env
+from surrogate.model import one_thread
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.task import reach
 from training.policies import ActorPolicy
+from training.sb3_vec_env import BatchedHopVecEnv
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class PolicyConfig:
     """Gradient steps per hop."""
     warmup: float = 0.125
     """Share of the hops with random stretches before learning starts."""
-    envs: int = 2
-    """Envs stepped side by side, one thread each."""
+    envs: int = 16
+    """Envs whose hops are simulated together; halved until it divides ``calls``, so that no hop is over budget."""
 
 
 @dataclass(frozen=True)
@@ -60,57 +60,8 @@ class PolicyCommand(PolicyConfig):
     """Checkpoint to write; its card goes beside it as .json."""
     scene: str = "earth"
     """Scene preset."""
-
-
-class ScaledObservation(gym.ObservationWrapper):
-    """Observations over a fixed scale, so that the nets see numbers of order one."""
-
-    def __init__(self, env: gym.Env, scale: float) -> None:
-        super().__init__(env)
-        self.scale = np.float32(scale)
-        box = env.observation_space
-        assert isinstance(box, gym.spaces.Box)
-        self.observation_space = gym.spaces.Box(box.low / self.scale, box.high / self.scale, dtype=np.float32)
-
-    def observation(self, observation: np.ndarray) -> np.ndarray:
-        """Scaled observation, shape as it came."""
-        return observation / self.scale
-
-
-class ThreadedVecEnv(DummyVecEnv):
-    """Envs stepped at the same time in threads: the simulator leaves Python's lock alone while it runs."""
-
-    def __init__(self, env_fns: Sequence[Any]) -> None:
-        super().__init__(list(env_fns))
-        self.pool = ThreadPoolExecutor(len(self.envs))
-
-    def step_wait(self) -> Any:
-        """Step all envs; as DummyVecEnv does, one after the other, with the physics already under way."""
-        running = [self.pool.submit(env.step, action) for env, action in zip(self.envs, self.actions, strict=True)]
-        plain = self.envs
-        try:
-            self.envs = [_Stepped(env, future) for env, future in zip(plain, running, strict=True)]  # type: ignore[misc]
-            return super().step_wait()
-        finally:
-            self.envs = plain
-
-    def close(self) -> None:
-        """Stop the threads, close the envs."""
-        self.pool.shutdown()
-        super().close()
-
-
-class _Stepped:
-    """Stands in for an env whose step is already running."""
-
-    def __init__(self, env: gym.Env, future: Any) -> None:
-        self.env, self.future = env, future
-
-    def step(self, action: np.ndarray) -> Any:
-        return self.future.result()
-
-    def reset(self, **options: Any) -> Any:
-        return self.env.reset(**options)
+    landing: str = "rest"
+    """Where a landing is read: rest or touchdown."""
 
 
 class _Watch(BaseCallback):
@@ -153,12 +104,7 @@ class ScaledAction(gym.ActionWrapper):
         return np.clip(low + (high - low) * (action + 1) / 2, low, high)
 
 
-def make_env(scene: Scene | str, scale: float) -> gym.Env:
-    """The registered env with observations over ``scale`` [m] and actions rescaled to [-1, 1], as policies want them."""
-    env = gym.make("TensegrityHop-v0", scene=scene)
-    return ScaledAction(ScaledObservation(env, scale))
-
-
+@one_thread()
 def train_policy(
     scene: Scene, config: PolicyConfig, *, budgets: Sequence[int] = (), progress: bool = True
 ) -> tuple[dict[int, ActorPolicy], dict[str, Any]]:
@@ -172,8 +118,10 @@ def train_policy(
         )
     started = time.perf_counter()
     scale = reach(scene)
-    envs = config.envs if config.calls % config.envs == 0 else 1  # every env steps at once, and no hop may be over budget
-    with contextlib.closing(ThreadedVecEnv([lambda: make_env(scene, scale)] * envs)) as venv:
+    envs = config.envs
+    while config.calls % envs:
+        envs = (envs + 1) // 2
+    with contextlib.closing(BatchedHopVecEnv(scene, scale, envs)) as venv:
         model = SAC(
             "MlpPolicy",
             venv,
@@ -192,14 +140,14 @@ def train_policy(
             watch = _Watch([*budgets, config.calls], scale, bar)
             model.learn(config.calls, callback=watch)
             watch.keep()
-        calls = sum(cast(Any, env.unwrapped).simulator_calls for env in venv.envs)
+        calls = venv.simulator_calls
     card = {"algorithm": "SAC", "train": asdict(config), "scene": asdict(scene), "simulator_calls": calls}
     return watch.snapshots, card | {"seconds": time.perf_counter() - started}
 
 
 def main(config: PolicyCommand) -> None:
     """Entry of ``python -m training policy``."""
-    actors, card = train_policy(Scene.preset(config.scene), config)
+    actors, card = train_policy(Scene.preset(config.scene, landing=config.landing), config)
     card["train"] = {k: str(v) if isinstance(v, Path) else v for k, v in card["train"].items()}
     actors[config.calls].save(config.out, card)
     print(f"{config.out}: SAC, {card['simulator_calls']} simulator calls in {card['seconds']:.1f} s")
