@@ -1,0 +1,105 @@
+"""Episodes of many registered envs, with all their hops simulated in one batch: a lone hop costs as much as eight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import tensegrity_gym
+from tensegrity_gym import Scene, simulate, task
+from tensegrity_gym.types import HopStatus
+
+
+class ScaledObservation(gym.ObservationWrapper):
+    """Observations over a fixed scale, so that the nets see numbers of order one."""
+
+    def __init__(self, env: gym.Env, scale: float) -> None:
+        super().__init__(env)
+        self.scale = np.float32(scale)
+        box = env.observation_space
+        assert isinstance(box, gym.spaces.Box)
+        self.observation_space = gym.spaces.Box(box.low / self.scale, box.high / self.scale, dtype=np.float32)
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """Scaled observation, shape as it came."""
+        return observation / self.scale
+
+
+class ScaledAction(gym.ActionWrapper):
+    """Actions in [-1, 1] onto the env's range; gymnasium's RescaleAction rounds beyond its ends, this one does not."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        box = env.action_space
+        assert isinstance(box, gym.spaces.Box)
+        self.box = box
+        self.action_space = gym.spaces.Box(-1.0, 1.0, shape=box.shape, dtype=np.float32)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """Stretches, shape as it came."""
+        low, high = self.box.low, self.box.high
+        return np.clip(low + (high - low) * (action + 1) / 2, low, high)
+
+
+def make_env(scene: Scene, scale: float) -> ScaledAction:
+    """The registered env with observations over ``scale`` [m] and actions rescaled to [-1, 1], as policies want them."""
+    return ScaledAction(ScaledObservation(gym.make("TensegrityHop-v0", scene=scene), scale))
+
+
+class BatchedHopVecEnv(DummyVecEnv):
+    """``envs`` of :func:`make_env` in one scene; gives what DummyVecEnv gives, bit by bit.
+
+    Targets, seeds, spaces and observations are the envs' own, rewards come from the same function that they call; only
+    ``simulate`` is called once for all of them. Infos hold ``landing`` (2,) [m], ``error`` [m] and ``status``.
+    """
+
+    def __init__(self, scene: Scene, scale: float, envs: int) -> None:
+        makers: Sequence[Callable[[], gym.Env]] = [lambda: make_env(scene, scale)] * envs
+        super().__init__(list(makers))
+        self.scene = scene
+        #: Hops simulated since the envs were made.
+        self.simulator_calls = 0
+
+    def step_wait(self) -> Any:
+        """Simulate one hop per env; every episode ends, and every env is reset."""
+        plain: list[Any] = self.envs
+        low, high = tensegrity_gym.STRETCH_RANGE  # float32 cannot hold them: cut the overshoot off, as the env does
+        stretches = np.stack([env.action(action) for env, action in zip(plain, self.actions, strict=True)]).astype(np.float64)
+        hop = simulate(np.clip(stretches, low, high), scene=self.scene)
+        self.simulator_calls += len(stretches)
+        targets = np.stack([info["target"] for info in self.reset_infos])
+        rewards = task.reward(hop.landing, targets, hop.status, task.reach(self.scene))
+        errors = task.landing_error(hop.landing, targets)
+        observations = self.buf_obs[None].copy()  # type: ignore[index]
+        outcomes = [
+            (
+                observations[k],
+                float(rewards[k]),
+                True,
+                False,
+                {"landing": hop.landing[k], "error": float(errors[k]), "status": HopStatus(int(hop.status[k]))},
+            )
+            for k in range(self.num_envs)
+        ]
+        self.envs = [_Stepped(env, outcome) for env, outcome in zip(plain, outcomes, strict=True)]  # type: ignore[misc]
+        try:
+            return super().step_wait()
+        finally:
+            self.envs = plain
+
+
+class _Stepped:
+    """Stands in for an env whose hop has been simulated."""
+
+    def __init__(self, env: gym.Env, outcome: tuple[Any, ...]) -> None:
+        self.env, self.outcome = env, outcome
+
+    def step(self, action: np.ndarray) -> tuple[Any, ...]:
+        return self.outcome
+
+    def reset(self, **options: Any) -> Any:
+        return self.env.reset(**options)
