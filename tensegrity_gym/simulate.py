@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +17,16 @@ from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.formfinding import Equilibria, form_find
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.timestep import default_time_step
+from tensegrity_gym.timestep import MARGIN, default_time_step
 from tensegrity_gym.types import ENERGY_NAMES, Floats, HopStatus, Structure
 from tensegrity_gym.version import MODEL_VERSION
 
+#: Integrators: kernel, by how much of a step velocities trail positions, critical step over symplectic Euler's.
+INTEGRATORS = {
+    "symplectic_euler": (kernel.rollout_symplectic_euler, 0.5, 1.0),
+    "velocity_verlet": (kernel.rollout_velocity_verlet, 0.0, 1.0),
+    "runge_kutta": (kernel.rollout_runge_kutta, 0.0, float(np.sqrt(2.0))),
+}
 #: Steps between two looks at rest, blow-up and frames.
 STRIDE = 32
 #: A lattice on the ground is quiet below this kinetic energy, over (total mass) g l.
@@ -80,6 +87,8 @@ def simulate(
     scene: Scene | None = None,
     lattice: Lattice | None = None,
     dt: float | None = None,
+    integrator: str = "symplectic_euler",
+    allow_unstable: bool = False,
     trajectory_rate: float | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -88,7 +97,8 @@ def simulate(
     """Hops of the lattice from the equilibria of ``stretches``, (n_actuators,) or (n, n_actuators).
 
     All actuators are unlocked at once at time 0 and the hop is followed to rest, at most for ``scene.duration``. ``dt`` [s]
-    defaults to 0.8 of the critical step; ``trajectory_rate`` [Hz] asks for frames; ``equilibria`` saves finding them again.
+    defaults to 0.8 of the critical step and may not exceed it unless ``allow_unstable``; ``integrator`` is one of
+    ``INTEGRATORS``; ``trajectory_rate`` [Hz] asks for frames; ``equilibria`` saves finding them again.
     ``progress`` is called with the number of hops newly ended. A hop that fails says so in ``status``, its neighbours go on.
 
     Raises InvalidStretchesError and InvalidParameterError.
@@ -96,16 +106,18 @@ def simulate(
     design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
     if equilibria is None:
         equilibria = form_find(stretches, design=design, scene=scene, lattice=lattice, threads=threads)
-    step = default_time_step(design, lattice) if dt is None else _positive("dt", dt)
+    if integrator not in INTEGRATORS:
+        raise InvalidParameterError(f"simulate: expected integrator in {sorted(INTEGRATORS)}, got {integrator!r}")
+    step = _time_step(dt, design, lattice, integrator, allow_unstable)
     rate = 0.0 if trajectory_rate is None else _positive("trajectory_rate", trajectory_rate)
     structure = design.structure(lattice)
-    settings = _settings(structure, equilibria, scene, design, step, rate)
+    settings = _settings(structure, equilibria, scene, design, step, INTEGRATORS[integrator][1], rate)
     parts = []
     for first in range(0, len(equilibria.stretches), CHUNK):
         chunk = slice(first, first + CHUNK)
         records = _records(equilibria.positions[chunk], equilibria.converged[chunk], settings)
-        _roll_out(structure, scene, settings, records, threads, progress)
-        parts.append(_measure(records, structure, scene, lattice, step))
+        _roll_out(INTEGRATORS[integrator][0], structure, scene, settings, records, threads, progress)
+        parts.append(_measure(records, structure, scene, lattice, settings.lag * settings.dt))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     frames = Trajectory(**{k[6:]: columns.pop(k) for k in list(columns) if k.startswith("frame_")})
     return HopResult(
@@ -119,6 +131,22 @@ def simulate(
     )
 
 
+def _time_step(dt: float | None, design: Design, lattice: Lattice, integrator: str, allow_unstable: bool) -> float:
+    """``dt`` if it is stable, or the default step [s]."""
+    gain = INTEGRATORS[integrator][2]
+    default = default_time_step(design, lattice)
+    if dt is None:
+        return default
+    step = _positive("dt", dt)
+    critical = gain * default / MARGIN
+    if step > critical and not allow_unstable:
+        raise InvalidParameterError(
+            f"simulate: dt = {step:.4g} s is above the critical step of {integrator}, {critical:.4g} s; use dt <= {MARGIN * critical:.4g} "
+            "or, to study the instability, allow_unstable=True"
+        )
+    return step
+
+
 def _positive(name: str, value: float) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not np.isfinite(value) or value <= 0:
         raise InvalidParameterError(f"simulate: expected {name} to be a finite number > 0, got {value!r}")
@@ -126,13 +154,14 @@ def _positive(name: str, value: float) -> float:
 
 
 def _settings(
-    structure: Structure, equilibria: Equilibria, scene: Scene, design: Design, dt: float, rate: float
+    structure: Structure, equilibria: Equilibria, scene: Scene, design: Design, dt: float, lag: float, rate: float
 ) -> kernel.HopSettings:
     weight_height = structure.mass.sum() * scene.gravity * design.cell_height
     blocks = int(np.ceil(scene.duration / dt / STRIDE))
     stored = float(np.max(equilibria.stored_energy, initial=0.0))
     return kernel.HopSettings(
         dt=dt,
+        lag=lag,
         max_steps=blocks * STRIDE,
         stride=STRIDE,
         rest_energy=REST_ENERGY * weight_height,
@@ -171,6 +200,9 @@ def hop_lanes(structure: Structure) -> kernel.LaneState:
         *(lanes_empty((len(structure.mass), 3)) for _ in range(3)),
         lanes_empty((structure.n_axial_members,)),
         lanes_empty((len(structure.mass), 3)),
+        lanes_empty((4 * len(structure.mass), 3)),
+        np.zeros((3, len(structure.mass), 3)),
+        np.zeros(structure.n_axial_members),
         lanes_empty((len(structure.actuators),)),
         lanes_empty((kernel.N_SCALARS,)),
         *(np.zeros(count, dtype=np.int64) for _ in range(3)),
@@ -179,6 +211,7 @@ def hop_lanes(structure: Structure) -> kernel.LaneState:
 
 
 def _roll_out(
+    run: Callable[..., None],
     structure: Structure,
     scene: Scene,
     settings: kernel.HopSettings,
@@ -189,7 +222,7 @@ def _roll_out(
     n = len(records.status)
 
     def work(first: int, last: int, counter: np.ndarray) -> None:
-        kernel.rollout_symplectic_euler(
+        run(
             structure,
             scene.ground,
             settings,
@@ -205,7 +238,7 @@ def _roll_out(
 
 
 def _measure(
-    records: kernel.HopRecords, structure: Structure, scene: Scene, lattice: Lattice, dt: float
+    records: kernel.HopRecords, structure: Structure, scene: Scene, lattice: Lattice, trail: float
 ) -> dict[str, np.ndarray]:
     """What the events say: displacements, speeds, times and energies of a chunk of hops."""
     centre = centre_of_mass(structure, records.state)  # (n, 4, 2, 3)
@@ -237,7 +270,7 @@ def _measure(
         "end_time": records.time[:, end],
         "status": records.status,
         "steps": records.steps,
-        "energies": _event_energies(records, structure, scene, dt),
+        "energies": _event_energies(records, structure, scene, trail),
         "frame_times": records.frame_times,
         "frame_positions": records.frame_positions,
         "frame_energies": records.frame_energies,
@@ -245,17 +278,18 @@ def _measure(
     }
 
 
-def _event_energies(records: kernel.HopRecords, structure: Structure, scene: Scene, dt: float) -> Floats:
+def _event_energies(records: kernel.HopRecords, structure: Structure, scene: Scene, trail: float) -> Floats:
     """Energies at the four events [J], columns ENERGY_NAMES, shape (n, 4, 7).
 
-    Potential energies are means over the two ends of the step in whose middle the event's state is, as in the kernel.
+    Where velocities trail positions by ``trail`` [s], potential energies are means over the two ends of the step in whose
+    middle the event's state is, as in the kernel.
     """
     n = len(records.status)
     energies = np.zeros((n, 4, len(ENERGY_NAMES)))
     lengths = np.broadcast_to(structure.actuator_length, (n, len(structure.actuator_length)))
     for event in range(4):
         positions, velocities = records.state[:, event, 0], records.state[:, event, 1]
-        for end in (positions - 0.5 * dt * velocities, positions + 0.5 * dt * velocities):
+        for end in (positions - trail * velocities, positions + trail * velocities):
             parts = elastic_energies(structure, end, lengths)
             parts["gravitational"] = gravitational_energy(structure, scene.gravity_vector, end)
             for name, values in parts.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tensegrity_gym.core.forces import dot
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import fma, select, splat, sqrt
 
@@ -21,3 +22,12 @@ def contact_impulse(vx, vy, vz, touching, friction, restitution):
     zero = splat(0.0, vz)
     keep = select(slides, 1.0 - limit / select(slides, speed, splat(1.0, vz)), zero)
     return select(active, keep * vx, vx), select(active, keep * vy, vy), select(active, vz + normal, vz)
+
+
+@jit
+def impulse_work(mass, vx, vy, vz, ax, ay, az, nx, ny, nz):
+    """Work [J] of the contact impulse that took a mass from v, with a kick a of the other forces, to n.
+
+    The impulse m (n - v - a) counts at the mean of the velocities before and after, so that a resting contact does none.
+    """
+    return 0.5 * mass * dot(nx - vx - ax, ny - vy - ay, nz - vz - az, vx + nx, vy + ny, vz + nz)

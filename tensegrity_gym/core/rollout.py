@@ -11,7 +11,7 @@ import numpy as np
 
 from tensegrity_gym.core.energy import actuator_energy, bar_energy, cable_energy, gravitational_energy, kinetic_energy
 from tensegrity_gym.core.forces import lattice_forces
-from tensegrity_gym.core.integrators import symplectic_euler_step
+from tensegrity_gym.core.integrators import runge_kutta_step, symplectic_euler_step, velocity_verlet_step
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import any_lane, fma, load, load1, select, splat, store, store1
 
@@ -23,6 +23,7 @@ class HopSettings(NamedTuple):
     """How hops are stepped, watched and ended."""
 
     dt: float  #: step [s]
+    lag: float  #: by how much of a step velocities trail positions: 0.5 for leapfrog, else 0
     max_steps: int  #: longest hop [steps], a multiple of ``stride``
     stride: int  #: steps between two looks at rest, blow-up and frames
     rest_energy: float  #: kinetic energy below which a lattice on the ground counts as quiet [J]
@@ -52,10 +53,13 @@ class LaneState(NamedTuple):
     """State of the lanes of one thread; the last axis is the lane."""
 
     x: np.ndarray  #: positions [m], shape (n_masses, 3, lanes)
-    v: np.ndarray  #: velocities half a step before [m/s], shape (n_masses, 3, lanes)
+    v: np.ndarray  #: velocities, ``lag`` of a step before [m/s], shape (n_masses, 3, lanes)
     f: np.ndarray  #: forces [N], shape (n_masses, 3, lanes)
     memory: np.ndarray  #: last damping force of each axial member [N], shape (n_axial_members, lanes)
     mid: np.ndarray  #: scratch positions [m], shape (n_masses, 3, lanes)
+    work: np.ndarray  #: scratch of the integrator, shape (4 n_masses, 3, lanes)
+    one: np.ndarray  #: scratch for one lattice: positions, velocities, forces, shape (3, n_masses, 3)
+    one_memory: np.ndarray  #: scratch for one lattice, shape (n_axial_members,)
     actuator_length: np.ndarray  #: natural lengths [m], shape (n_actuators, lanes)
     scalars: np.ndarray  #: rows named below, shape (N_SCALARS, lanes)
     hop: np.ndarray  #: which hop each lane runs, -1 for none, shape (lanes,)
@@ -69,17 +73,25 @@ FRAME = 9  # five rows of frame energies start here
 N_SCALARS = 14
 
 
-@jit(forceinline=False)
-def load_hop(lanes, lane, positions, dt):
-    """Put a hop at rest in ``positions`` (n_masses, 3) into a lane."""
+@jit
+def load_hop(forces, structure, ground, actuator_length, lanes, lane, positions, dt):
+    """Put a hop at rest in ``positions`` (n_masses, 3) into a lane, with the forces that act as its actuators unlock."""
+    x, v, f = lanes.one[0], lanes.one[1], lanes.one[2]
     lowest = 1e30
     for i in range(positions.shape[0]):
         for c in range(3):
-            lanes.x[i, c, lane] = positions[i, c]
-            lanes.v[i, c, lane] = 0.0
+            x[i, c] = positions[i, c]
+            v[i, c] = 0.0
         lowest = min(lowest, positions[i, 2])
     for row in range(lanes.memory.shape[0]):
+        lanes.one_memory[row] = 0.0
         lanes.memory[row, lane] = 0.0
+    forces(structure, actuator_length, ground.gravity, x, v, f, lanes.one_memory)
+    for i in range(positions.shape[0]):
+        for c in range(3):
+            lanes.x[i, c, lane] = x[i, c]
+            lanes.v[i, c, lane] = 0.0
+            lanes.f[i, c, lane] = f[i, c]
     for row in range(N_SCALARS):
         lanes.scalars[row, lane] = 0.0
     lanes.scalars[KICK, lane] = 0.5 * dt  # leapfrog start: velocities live half a step behind
@@ -89,14 +101,15 @@ def load_hop(lanes, lane, positions, dt):
 
 
 @jit(forceinline=False)
-def save_event(lanes, lane, records, hop, event, dt, time):
-    """Store a lane's state at the middle of the last step, where positions and velocities are synchronous."""
+def save_event(settings, lanes, lane, records, hop, event, time):
+    """Store a lane's state where its positions and velocities are synchronous, ``lag`` of a step ago."""
+    trail = settings.lag * settings.dt
     for i in range(lanes.x.shape[0]):
         for c in range(3):
             velocity = lanes.v[i, c, lane]
-            records.state[hop, event, 0, i, c] = lanes.x[i, c, lane] - 0.5 * dt * velocity
+            records.state[hop, event, 0, i, c] = lanes.x[i, c, lane] - trail * velocity
             records.state[hop, event, 1, i, c] = velocity
-    records.time[hop, event] = time - 0.5 * dt
+    records.time[hop, event] = time - trail
     records.dissipated[hop, event, 0] = lanes.scalars[CONTACT_LOSS, lane]
     records.dissipated[hop, event, 1] = lanes.scalars[DAMPING_LOSS, lane]
 
@@ -129,18 +142,17 @@ def contact_change(structure, settings, lanes, lane, records, hop, flown, time):
     """
     if flown:
         return True
-    dt = settings.dt
     speed = vertical_velocity(structure, lanes, lane)
     if lanes.scalars[AIRBORNE, lane] > 0.0:
         if speed > settings.flight_speed:
-            save_event(lanes, lane, records, hop, TAKEOFF, dt, time)
+            save_event(settings, lanes, lane, records, hop, TAKEOFF, time)
         return False
     if records.time[hop, TAKEOFF] <= 0.0 or speed >= 0.0:
         return False
-    save_event(lanes, lane, records, hop, TOUCHDOWN, dt, time)
+    save_event(settings, lanes, lane, records, hop, TOUCHDOWN, time)
     before, after = lanes.scalars[WAS_LOWEST, lane], lanes.scalars[LOWEST, lane]
-    # contact at time - dt (1 - share), the state is at time - dt / 2
-    records.touchdown_shift[hop] = dt * (before / (before - after) - 0.5)
+    # contact at time - dt (1 - share), the state is at time - lag dt
+    records.touchdown_shift[hop] = settings.dt * (before / (before - after) - 1.0 + settings.lag)
     return True
 
 
@@ -159,17 +171,18 @@ def watch(structure, lanes):
 
 
 @jit(forceinline=False)
-def frame_energies(structure, ground, lanes, dt):
-    """Fill the five FRAME rows [J] with all lanes' energies at the middle of the last step.
+def frame_energies(structure, settings, ground, lanes):
+    """Fill the five FRAME rows [J] with all lanes' energies at the instant that ``save_event`` takes.
 
-    Potential energies are means over the step's two ends: with the kinetic energy between them that is what leapfrog keeps.
+    With leapfrog, potential energies are means over the step's two ends: with the kinetic energy between them that is what
+    it keeps.
     """
     for row in range(5):
         store1(lanes.scalars, FRAME + row, load1(lanes.scalars, FRAME) * 0.0)
     for back in range(2):
         for i in range(structure.mass.shape[0]):
             for c in range(3):
-                store(lanes.mid, i, c, fma(load(lanes.v, i, c), -back * dt, load(lanes.x, i, c)))
+                store(lanes.mid, i, c, fma(load(lanes.v, i, c), -2.0 * back * settings.lag * settings.dt, load(lanes.x, i, c)))
         _add_half(lanes, FRAME, bar_energy(structure, lanes.mid))
         _add_half(lanes, FRAME + 1, cable_energy(structure, lanes.mid))
         _add_half(lanes, FRAME + 2, actuator_energy(structure, lanes.actuator_length, lanes.mid))
@@ -183,15 +196,16 @@ def _add_half(lanes, row, energy):
 
 
 @jit(forceinline=False)
-def save_frame(lanes, lane, records, hop, dt, time):
+def save_frame(settings, lanes, lane, records, hop, time):
     """Append one frame of a lane; ``frame_energies`` must be fresh."""
     frame = records.frame_count[hop]
     if frame >= records.frame_times.shape[1]:
         return
-    records.frame_times[hop, frame] = time - 0.5 * dt
+    trail = settings.lag * settings.dt
+    records.frame_times[hop, frame] = time - trail
     for i in range(lanes.x.shape[0]):
         for c in range(3):
-            records.frame_positions[hop, frame, i, c] = lanes.x[i, c, lane] - 0.5 * dt * lanes.v[i, c, lane]
+            records.frame_positions[hop, frame, i, c] = lanes.x[i, c, lane] - trail * lanes.v[i, c, lane]
     for k in range(5):
         records.frame_energies[hop, frame, k] = lanes.scalars[FRAME + k, lane]
     records.frame_energies[hop, frame, 5] = lanes.scalars[CONTACT_LOSS, lane]
@@ -213,7 +227,7 @@ def verdict(settings, lanes, lane, step, quiet, flown):
 
 
 @jit(forceinline=False)
-def end_hop(lanes, lane, records, hop, status, step, flown, dt):
+def end_hop(settings, lanes, lane, records, hop, status, step, flown):
     """Store how a hop ended. A blown-up one ends where it started: a finite number that its status disowns."""
     records.status[hop] = status
     records.steps[hop] = step
@@ -221,9 +235,9 @@ def end_hop(lanes, lane, records, hop, status, step, flown, dt):
     if status == UNSTABLE:
         copy_state(records, hop, RELEASE, END)
         records.height[hop] = 0.0
-        records.time[hop, END] = step * dt
+        records.time[hop, END] = step * settings.dt
     else:
-        save_event(lanes, lane, records, hop, END, dt, step * dt)
+        save_event(settings, lanes, lane, records, hop, END, step * settings.dt)
     if not flown:
         for event in (TAKEOFF, TOUCHDOWN):
             copy_state(records, hop, END, event)
@@ -261,10 +275,11 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
         flown[lane] = False
         for k in range(actuator_length.shape[0]):
             lanes.actuator_length[k, lane] = actuator_length[k]
-        load_hop(lanes, lane, records.state[first, RELEASE, 0], dt)  # idle lanes must hold a sane lattice too
+        # idle lanes must hold a sane lattice too
+        load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[first, RELEASE, 0], dt)
         queue = next_hop(records, queue, last)
         if queue < last:
-            load_hop(lanes, lane, records.state[queue, RELEASE, 0], dt)
+            load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[queue, RELEASE, 0], dt)
             hop[lane] = queue
             queue += 1
             running += 1
@@ -272,7 +287,17 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
         for k in range(settings.stride):
             kick = load1(lanes.scalars, KICK)
             power, lost, lowest = step_function(
-                forces, structure, lanes.actuator_length, ground, dt, kick, lanes.x, lanes.v, lanes.f, lanes.memory
+                forces,
+                structure,
+                lanes.actuator_length,
+                ground,
+                dt,
+                kick,
+                lanes.x,
+                lanes.v,
+                lanes.f,
+                lanes.memory,
+                lanes.work,
             )
             store1(lanes.scalars, KICK, splat(dt, kick))
             store1(lanes.scalars, CONTACT_LOSS, load1(lanes.scalars, CONTACT_LOSS) + lost)
@@ -299,16 +324,16 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
             if settings.frame_stride > 0 and hop[lane] >= 0 and step[lane] % settings.frame_stride == 0:
                 frames_due = True
         if frames_due:
-            frame_energies(structure, ground, lanes, dt)
+            frame_energies(structure, settings, ground, lanes)
         for lane in range(count):
             if hop[lane] < 0:
                 continue
             if frames_due and step[lane] % settings.frame_stride == 0:
-                save_frame(lanes, lane, records, hop[lane], dt, step[lane] * dt)
+                save_frame(settings, lanes, lane, records, hop[lane], step[lane] * dt)
             status = verdict(settings, lanes, lane, step[lane], quiet[lane], flown[lane])
             if status < 0:
                 continue
-            end_hop(lanes, lane, records, hop[lane], status, step[lane], flown[lane], dt)
+            end_hop(settings, lanes, lane, records, hop[lane], status, step[lane], flown[lane])
             progress[0] += 1
             hop[lane] = -1
             running -= 1
@@ -320,15 +345,52 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
                 step[lane] = 0
                 quiet[lane] = 0
                 flown[lane] = False
-                load_hop(lanes, lane, records.state[hop[lane], RELEASE, 0], dt)
+                start = records.state[hop[lane], RELEASE, 0]
+                load_hop(forces, structure, ground, actuator_length, lanes, lane, start, dt)
 
 
 @jit(cache=True)
 def rollout_symplectic_euler(structure, ground, settings, actuator_length, records, lanes, first, last, progress):
-    """:func:`rollout` with the forces of the lattice and symplectic Euler, compiled once and cached."""
+    """:func:`rollout` of the lattice by symplectic Euler, compiled once and cached."""
     rollout(
         lattice_forces,
         symplectic_euler_step,
+        structure,
+        ground,
+        settings,
+        actuator_length,
+        records,
+        lanes,
+        first,
+        last,
+        progress,
+    )
+
+
+@jit(cache=True)
+def rollout_velocity_verlet(structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+    """:func:`rollout` of the lattice by velocity Verlet, compiled once and cached."""
+    rollout(
+        lattice_forces,
+        velocity_verlet_step,
+        structure,
+        ground,
+        settings,
+        actuator_length,
+        records,
+        lanes,
+        first,
+        last,
+        progress,
+    )
+
+
+@jit(cache=True)
+def rollout_runge_kutta(structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+    """:func:`rollout` of the lattice by the classical Runge-Kutta method, compiled once and cached."""
+    rollout(
+        lattice_forces,
+        runge_kutta_step,
         structure,
         ground,
         settings,

@@ -1,20 +1,19 @@
-"""One step of a batch of lattices, given their force function.
+"""Symplectic Euler with a leapfrog start: positions at whole steps, velocities at half steps. Second order, one force a step.
 
-Symplectic Euler with a leapfrog start: positions at whole steps, velocities at half steps, second order. Within a step the
-order is collisions, velocities, contacts, positions: with any other a block at rest on an incline creeps or bounces.
+Within a step the order is collisions, velocities, contacts, positions: with any other a block at rest on an incline creeps
+or bounces.
 """
 
 from __future__ import annotations
 
-from tensegrity_gym.core.contact import contact_impulse
-from tensegrity_gym.core.forces import dot
+from tensegrity_gym.core.contact import contact_impulse, impulse_work
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import any_lane, fma, load, select, store
 
 
 @jit
-def symplectic_euler_step(forces, structure, actuator_length, ground, dt, kick, x, v, f, memory):
-    """Advance x [m] and v [m/s] by one step; ``kick`` [s] is dt, or dt/2 in a lane's first step from rest.
+def symplectic_euler_step(forces, structure, actuator_length, ground, dt, kick, x, v, f, memory, work):
+    """Advance x [m] and v [m/s] by one step; ``kick`` [s] is dt, or dt/2 in a lane's first step from rest; ``work`` is not used.
 
     ``forces(structure, actuator_length, gravity, x, v, f, memory)`` fills f [N] and returns the power damping dissipates [W].
     Returns (that power, energy that contacts dissipated in this step [J], lowest z after it [m]).
@@ -33,10 +32,8 @@ def symplectic_euler_step(forces, structure, actuator_length, ground, dt, kick, 
             kx, ky, kz = cx + ax, cy + ay, cz + az
             # the second pass only takes away what this step's forces push into the ground: a resting contact, e = 0
             nx, ny, nz = contact_impulse(kx, ky, kz, touching, ground.friction, 0.0)
-            # work of the contact impulse at the mean of the velocities before and after, so that rest costs nothing
-            jx, jy, jz = nx - vx - ax, ny - vy - ay, nz - vz - az
-            work = 0.5 * structure.mass[i] * dot(jx, jy, jz, vx + nx, vy + ny, vz + nz)
-            dissipated = select(touching, dissipated - work, dissipated)
+            done = impulse_work(structure.mass[i], vx, vy, vz, ax, ay, az, nx, ny, nz)
+            dissipated = select(touching, dissipated - done, dissipated)
             vx, vy, vz = nx, ny, nz
         else:
             vx, vy, vz = vx + ax, vy + ay, vz + az

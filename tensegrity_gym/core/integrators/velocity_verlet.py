@@ -1,0 +1,48 @@
+"""Velocity Verlet: positions and velocities at whole steps. Second order, one force a step.
+
+The damping force takes the velocity of the half step, which keeps it explicit; a contact impulse follows each half kick.
+"""
+
+from __future__ import annotations
+
+from tensegrity_gym.core.contact import contact_impulse, impulse_work
+from tensegrity_gym.core.jit import jit
+from tensegrity_gym.core.lanes import any_lane, fma, load, select, splat, store
+
+
+@jit
+def velocity_verlet_step(forces, structure, actuator_length, ground, dt, kick, x, v, f, memory, work):
+    """Advance x [m] and v [m/s] by one step; ``f`` holds the forces at x [N] and leaves with those at the new x.
+
+    ``kick`` and ``work`` are not used. Returns as described in the package.
+    """
+    first = _half_kick(structure, ground, splat(0.5 * dt, kick), ground.restitution, x, v, f)
+    lowest = load(x, 0, 2) + 1e30
+    for i in range(structure.mass.shape[0]):
+        for c in range(3):
+            store(x, i, c, fma(load(v, i, c), dt, load(x, i, c)))
+        z = load(x, i, 2)
+        lowest = select(z < lowest, z, lowest)
+    power = forces(structure, actuator_length, ground.gravity, x, v, f, memory)
+    return power, first + _half_kick(structure, ground, splat(0.5 * dt, kick), 0.0, x, v, f), lowest
+
+
+@jit
+def _half_kick(structure, ground, half, restitution, x, v, f):
+    """v += half f / m with the ground's impulses; returns the energy that these dissipate [J]."""
+    dissipated = half * 0.0
+    for i in range(structure.mass.shape[0]):
+        inverse = half * structure.inverse_mass[i]
+        vx, vy, vz = load(v, i, 0), load(v, i, 1), load(v, i, 2)
+        ax, ay, az = load(f, i, 0) * inverse, load(f, i, 1) * inverse, load(f, i, 2) * inverse
+        touching = load(x, i, 2) <= 0.0
+        nx, ny, nz = vx + ax, vy + ay, vz + az
+        if any_lane(touching):
+            cx, cy, cz = contact_impulse(vx, vy, vz, touching, ground.friction, restitution)
+            nx, ny, nz = contact_impulse(cx + ax, cy + ay, cz + az, touching, ground.friction, 0.0)
+            done = impulse_work(structure.mass[i], vx, vy, vz, ax, ay, az, nx, ny, nz)
+            dissipated = select(touching, dissipated - done, dissipated)
+        store(v, i, 0, nx)
+        store(v, i, 1, ny)
+        store(v, i, 2, nz)
+    return dissipated
