@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,7 +22,7 @@ def shares(n: int, parts: int, lanes: int) -> list[tuple[int, int]]:
     blocks = -(-n // lanes)
     parts = max(1, min(parts, blocks))
     edges = [min(n, lanes * (blocks * p // parts)) for p in range(parts + 1)]
-    return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    return [(a, b) for a, b in pairwise(edges) if b > a]
 
 
 def run_shares(

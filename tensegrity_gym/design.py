@@ -125,11 +125,17 @@ class Design:
         for field in fields(self):
             value = getattr(self, field.name)
             may_be_zero = field.name in ("prestrain", "bar_damping", "cable_damping", "hinge_damping")
-            if not isinstance(value, (int, float, np.number)) or not np.isfinite(value) or not (value > 0 or (may_be_zero and value == 0)):
+            if (
+                not isinstance(value, (int, float, np.number))
+                or not np.isfinite(value)
+                or not (value > 0 or (may_be_zero and value == 0))
+            ):
                 bound = ">= 0" if may_be_zero else "> 0"
                 raise InvalidParameterError(f"Design.{field.name}: expected a finite number {bound}, got {value!r}")
         if int(self.bar_segments) != self.bar_segments or self.bar_segments > MAX_SEGMENTS:
-            raise InvalidParameterError(f"Design.bar_segments: expected an integer from 1 to {MAX_SEGMENTS}, got {self.bar_segments!r}")
+            raise InvalidParameterError(
+                f"Design.bar_segments: expected an integer from 1 to {MAX_SEGMENTS}, got {self.bar_segments!r}"
+            )
 
     @property
     def cell_height(self) -> float:

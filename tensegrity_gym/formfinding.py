@@ -169,9 +169,7 @@ def _newton(
 
     def work(first: int, last: int, counter: np.ndarray) -> None:
         lanes = newton_lanes(structure, pattern.n_slots)
-        newton_equilibria(
-            structure, pattern, normal_gravity, dead_load, settings, values, records, lanes, first, last, counter
-        )
+        newton_equilibria(structure, pattern, normal_gravity, dead_load, settings, values, records, lanes, first, last, counter)
 
     run_shares(work, n, threads, lane_count(np.float64), progress)
     return records

@@ -22,7 +22,7 @@ FACES: tuple[Node, ...] = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 
 
 def cell_nodes() -> list[Node]:
     """The 24 nominal nodes of one cell, sorted: all permutations of (0, +-1, +-2)."""
-    return sorted({p for s, t in product((1, -1), repeat=2) for p in permutations((0, s, 2 * t))})
+    return sorted({(x, y, z) for s, t in product((1, -1), repeat=2) for x, y, z in permutations((0, s, 2 * t))})
 
 
 def cell_bars(chirality: int) -> list[tuple[Node, Node]]:

@@ -127,7 +127,7 @@ def simulate(
         equilibria=equilibria,
         dt=step,
         trajectory=frames if rate else None,
-        **columns,
+        **columns,  # type: ignore[arg-type]
     )
 
 
@@ -141,8 +141,8 @@ def _time_step(dt: float | None, design: Design, lattice: Lattice, integrator: s
     critical = gain * default / MARGIN
     if step > critical and not allow_unstable:
         raise InvalidParameterError(
-            f"simulate: dt = {step:.4g} s is above the critical step of {integrator}, {critical:.4g} s; use dt <= {MARGIN * critical:.4g} "
-            "or, to study the instability, allow_unstable=True"
+            f"simulate: dt = {step:.4g} s is above the critical step of {integrator}, {critical:.4g} s; "
+            f"use dt <= {MARGIN * critical:.4g} or, to study the instability, allow_unstable=True"
         )
     return step
 
@@ -195,18 +195,22 @@ def _records(positions: Floats, converged: np.ndarray, settings: kernel.HopSetti
 
 def hop_lanes(structure: Structure) -> kernel.LaneState:
     """Work arrays of one thread."""
-    count = lane_count(np.float64)
+    count, n = lane_count(np.float64), len(structure.mass)
     return kernel.LaneState(
-        *(lanes_empty((len(structure.mass), 3)) for _ in range(3)),
-        lanes_empty((structure.n_axial_members,)),
-        lanes_empty((len(structure.mass), 3)),
-        lanes_empty((4 * len(structure.mass), 3)),
-        np.zeros((3, len(structure.mass), 3)),
-        np.zeros(structure.n_axial_members),
-        lanes_empty((len(structure.actuators),)),
-        lanes_empty((kernel.N_SCALARS,)),
-        *(np.zeros(count, dtype=np.int64) for _ in range(3)),
-        np.zeros(count, dtype=np.bool_),
+        x=lanes_empty((n, 3)),
+        v=lanes_empty((n, 3)),
+        f=lanes_empty((n, 3)),
+        memory=lanes_empty((structure.n_axial_members,)),
+        mid=lanes_empty((n, 3)),
+        work=lanes_empty((4 * n, 3)),
+        one=np.zeros((3, n, 3)),
+        one_memory=np.zeros(structure.n_axial_members),
+        actuator_length=lanes_empty((len(structure.actuators),)),
+        scalars=lanes_empty((kernel.N_SCALARS,)),
+        hop=np.zeros(count, dtype=np.int64),
+        step=np.zeros(count, dtype=np.int64),
+        quiet=np.zeros(count, dtype=np.int64),
+        flown=np.zeros(count, dtype=np.bool_),
     )
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from surrogate import model
+from surrogate.correction import fit_correction
 from surrogate.dataset import COLUMNS, Configuration, HopData
 from surrogate.evaluate import rmse, spread
 from surrogate.generate import sample_stretches
@@ -80,6 +81,32 @@ def test_learns_a_closed_form_map_and_same_seed_gives_same_bits() -> None:
     first, second = (train(data, QUICK, progress=False)[0] for _ in range(2))
     for name, value in first.state_dict().items():
         assert torch.equal(value, second.state_dict()[name])
+
+
+def test_correction_repeats_stored_hops_stays_equivariant_and_doubts_what_is_far() -> None:
+    data = closed_form_data(120)
+    net, _ = train(data, replace(QUICK, epochs=3), progress=False)  # hardly trained: much is left to correct
+    unseen = closed_form_data(60, seed=9)
+    fitted = fit_correction(net, data, 0.1, 0.1)
+    assert fitted is not None
+    correction, scale = fitted
+    split = data.split()
+    with torch.no_grad():
+        seen = torch.from_numpy(data["stretches"][split["train"]].astype(np.float32))
+        shift, variance = correction(seen)
+        error = (net.landing(seen).mean(dim=0) + shift).numpy() - data["landing"][split["train"]]
+        assert np.abs(error).max() < 0.1 * scale.sigma
+        assert (variance <= scale.sigma**2).all()
+        other = torch.from_numpy(unseen["stretches"].astype(np.float32))
+        plain = np.linalg.norm(net.landing(other).mean(dim=0).numpy() - unseen["landing"], axis=1)
+        shift, far = correction(other)
+        mended = np.linalg.norm((net.landing(other).mean(dim=0) + shift).numpy() - unseen["landing"], axis=1)
+        assert mended.mean() < 0.5 * plain.mean()
+        assert far.mean() > variance.mean()
+        for perm, signs in zip(LATTICE.symmetries, LATTICE.symmetry_signs, strict=True):
+            image = correction(other[:, perm])[0] * torch.as_tensor(signs)
+            torch.testing.assert_close(image, shift, rtol=0, atol=1e-3 * float(shift.abs().max()))
+    assert fit_correction(net, data.rows(slice(0, 1)), 0.1, 0.1) is None
 
 
 def test_hops_that_lack_an_output_train_the_others() -> None:

@@ -62,7 +62,7 @@ class InverseConfig:
 
     pool: int = 4096
     """Spread-out stretches that the starts are chosen from."""
-    starts: int = 16
+    starts: int = 8
     """Descents per target."""
     steps: int = 120
     """Adam steps per descent."""
@@ -71,24 +71,35 @@ class InverseConfig:
 
 
 class InversePlanner:
-    """Find the stretches whose expected squared landing error, over the ensemble's members, is least.
+    """Find the stretches whose expected squared landing error is least.
 
-    That is the squared error of the mean plus the members' spread, so among equals it takes the stretches that the
-    surrogate is surest of. Descent is on the stretches themselves, put back into the box after every step, so that answers
-    on its boundary are reached (a sigmoid would stall there).
+    Expected are the error of the members' mean, their spread and, with a ``correction``, the variance that distance from
+    the stored hops brings: among equals it takes the stretches that it is surest of. Descent is on the stretches
+    themselves, put back into the box after every step, so that answers on its boundary are reached (a sigmoid would stall
+    there).
 
     Args:
         landing: stretches, shape (n, n_actuators), to landings as each member sees them, shape (members, n, 2) [m].
+        correction: stretches to a shift of the landing, shape (n, 2) [m], and a variance, shape (n,) [m^2].
+        stored: stretches to start from besides the spread-out ones, shape (m, n_actuators).
     """
 
     def __init__(
-        self, landing: Callable[[Tensor], Tensor], config: InverseConfig | None = None, *, n_actuators: int = 4, seed: int = 0
+        self,
+        landing: Callable[[Tensor], Tensor],
+        config: InverseConfig | None = None,
+        *,
+        correction: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
+        stored: np.ndarray | None = None,
+        n_actuators: int = 4,
+        seed: int = 0,
     ) -> None:
-        self.landing = landing
+        self.landing, self.correction = landing, correction
         self.config = config or InverseConfig()
-        self.pool = torch.from_numpy(sample_stretches(self.config.pool, seed, n_actuators).astype(np.float32))
+        pool = sample_stretches(self.config.pool, seed, n_actuators)
+        self.pool = torch.from_numpy((pool if stored is None else np.concatenate([pool, stored])).astype(np.float32))
         with torch.no_grad():
-            self.pool_landings = landing(self.pool)
+            self.pool_seen = self._see(self.pool)
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -102,7 +113,8 @@ class InversePlanner:
         """Targets (n, 2) [m] to stretches (n, n_actuators) and the expected landing error (rms) of each, (n,) [m]."""
         goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))[:, None]  # (n, 1, 2)
         with torch.no_grad():
-            cost = ((self.pool_landings[:, None] - goal) ** 2).sum(dim=-1).mean(dim=0)  # (n, pool)
+            landings, variance = self.pool_seen
+            cost = expected_square(landings[:, None], variance, goal)  # (n, pool)
             first = cost.topk(min(self.config.starts, len(self.pool)), largest=False).indices
         stretches = self._descend(self.pool[first], goal)
         with torch.no_grad():
@@ -126,8 +138,21 @@ class InversePlanner:
                 stretches.clamp_(*STRETCH_RANGE)
         return stretches.detach()
 
+    def _see(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
+        """Landings (members, n, 2) [m] and variance (n,) [m^2] at stretches (n, n_actuators)."""
+        landings = self.landing(stretches)
+        if self.correction is None:
+            return landings, torch.zeros(len(stretches))
+        shift, variance = self.correction(stretches)
+        return landings + shift, variance
+
     def _cost(self, stretches: Tensor, goal: Tensor) -> Tensor:
         """Expected squared error [m^2] of stretches (n, starts, n_actuators), shape (n, starts)."""
-        seen = self.landing(stretches.reshape(-1, stretches.shape[-1]))
-        seen = seen.reshape(seen.shape[0], *stretches.shape[:2], 2)
-        return ((seen - goal) ** 2).sum(dim=-1).mean(dim=0)
+        batch = stretches.shape[:2]
+        landings, variance = self._see(stretches.reshape(-1, stretches.shape[-1]))
+        return expected_square(landings.reshape(-1, *batch, 2), variance.reshape(batch), goal)
+
+
+def expected_square(landings: Tensor, variance: Tensor, goal: Tensor) -> Tensor:
+    """Mean over members (first axis) of the squared distance to ``goal``, and ``variance`` in both directions [m^2]."""
+    return ((landings - goal) ** 2).sum(dim=-1).mean(dim=0) + 2 * variance

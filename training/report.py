@@ -78,7 +78,9 @@ def write(
     table = _html_table([t for _, t, _ in COLUMNS], [[format(row[key], form) for key, _, form in COLUMNS] for row in rows])
     note = (
         "Wall time is all a method needs before its last answer: simulating its hops, training, answering. Per answer: a "
-        "batch's time over its targets. Targets are landings of other simulated hops, which no method learnt from."
+        "batch's time over its targets. Targets are landings of other simulated hops, which no method learnt from. A stored "
+        "hop repeats bit by bit in simulation, where nothing scatters its start: that flatters the nearest stored hop "
+        "wherever landings are chaotic."
     )
     page = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tensegrity hop demo</title><style>{STYLE}</style>',

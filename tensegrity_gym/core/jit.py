@@ -20,7 +20,10 @@ def _cache_folder() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(file.read_bytes())
-    root = os.environ.get("TENSEGRITY_GYM_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tensegrity_gym"
+    root = (
+        os.environ.get("TENSEGRITY_GYM_CACHE")
+        or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tensegrity_gym"
+    )
     folder = Path(root) / digest.hexdigest()[:16]
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -48,7 +48,13 @@ def cable_tangent(i, j, slot, stiffness, natural, x, h):
     taut = length > natural
     inv = 1.0 / select(taut, length, splat(1.0, length))
     tension = select(taut, stiffness * (length - natural), zero)
-    add_pair(h, i, j, slot, spring_block(select(taut, splat(1.0, length) * stiffness, zero), tension, inv, (dx * inv, dy * inv, dz * inv)))
+    add_pair(
+        h,
+        i,
+        j,
+        slot,
+        spring_block(select(taut, splat(1.0, length) * stiffness, zero), tension, inv, (dx * inv, dy * inv, dz * inv)),
+    )
 
 
 @jit

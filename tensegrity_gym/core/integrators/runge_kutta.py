@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from tensegrity_gym.core.contact import contact_impulse, impulse_work
 from tensegrity_gym.core.jit import jit
-from tensegrity_gym.core.lanes import any_lane, fma, load, select, splat, store
+from tensegrity_gym.core.lanes import any_lane, fma, load, select, store
 
 
 @jit
