@@ -39,6 +39,12 @@ class Structure(NamedTuple):
     hinge_stiffness: Floats  #: kappa of each hinge between two segments [N m/rad], shape (n_bars,)
     hinge_damping: Floats  #: c = beta_h * kappa [N m s/rad], shape (n_bars,)
 
+    def astype(self, dtype: np.dtype) -> Structure:
+        """The same structure with its floating-point fields in ``dtype``; itself where they are already."""
+        if self.mass.dtype == dtype:
+            return self
+        return Structure(*(a.astype(dtype) if a.dtype.kind == "f" else a for a in self))
+
     @property
     def n_axial_members(self) -> int:
         """Bar segments, cables and actuated cables."""

@@ -43,6 +43,7 @@ class HopRecords(NamedTuple):
     height: np.ndarray  #: highest z of the centre of mass [m], shape (n,)
     steps: np.ndarray  #: steps taken, shape (n,)
     status: np.ndarray  #: HopStatus, shape (n,)
+    failed_mass: np.ndarray  #: the mass that ran away in an unstable hop, else -1, shape (n,)
     frame_positions: np.ndarray  #: [m], shape (n, n_frames, n_masses, 3); n_frames is 0 without frames
     frame_times: np.ndarray  #: [s], shape (n, n_frames)
     frame_energies: np.ndarray  #: [J], columns types.ENERGY_NAMES, shape (n, n_frames, 7)
@@ -227,12 +228,26 @@ def verdict(settings, lanes, lane, step, quiet, flown):
 
 
 @jit(forceinline=False)
+def runaway_mass(lanes, lane):
+    """The first mass whose velocity is not finite, else the fastest."""
+    fastest, found = -1.0, 0
+    for i in range(lanes.v.shape[0]):
+        square = lanes.v[i, 0, lane] ** 2 + lanes.v[i, 1, lane] ** 2 + lanes.v[i, 2, lane] ** 2
+        if not square < 1e300:
+            return i
+        if square > fastest:
+            fastest, found = square, i
+    return found
+
+
+@jit(forceinline=False)
 def end_hop(settings, lanes, lane, records, hop, status, step, flown):
     """Store how a hop ended. A blown-up one ends where it started: a finite number that its status disowns."""
     records.status[hop] = status
     records.steps[hop] = step
     records.height[hop] = lanes.scalars[HEIGHT, lane]
     if status == UNSTABLE:
+        records.failed_mass[hop] = runaway_mass(lanes, lane)
         copy_state(records, hop, RELEASE, END)
         records.height[hop] = 0.0
         records.time[hop, END] = step * settings.dt
