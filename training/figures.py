@@ -162,6 +162,10 @@ def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float,
         axes.set(xscale="log", yscale="log", xlabel="simulator calls", ylabel="landing error [m]")
         axes.set_xticks(calls, [str(c) for c in calls])
         axes.minorticks_off()
-        axes.secondary_yaxis("right", functions=(percent, metres)).set_ylabel("[% of reach]")
+        right = axes.secondary_yaxis("right", functions=(percent, metres))
+        right.set_ylabel("landing error [% of reach]")
+        for axis in (axes.yaxis, right.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("")
         axes.legend(loc="lower left")
         return _save(figure, path)
