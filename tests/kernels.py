@@ -10,7 +10,7 @@ import numpy as np
 from tensegrity_gym.core.cholesky import factorise, solve
 from tensegrity_gym.core.energy import actuator_energy, bar_energy, cable_energy, gravitational_energy, kinetic_energy
 from tensegrity_gym.core.forces import lattice_forces
-from tensegrity_gym.core.integrators import symplectic_euler_step
+from tensegrity_gym.core.integrators import runge_kutta_step, symplectic_euler_step, velocity_verlet_step
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import any_lane, fma, lane_count, lanes_empty, load, load1, select, splat, sqrt, store, store1
 from tensegrity_gym.core.members import angle_over_sine, angle_squared, cable_tension, hinge_damping_factor
@@ -129,16 +129,44 @@ def cholesky(pattern, h, y, floor, worst):
     solve(pattern, h, y)
 
 
-@jit(cache=True)
-def advance(structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses):
-    """Step ``steps`` times; losses[0] += damping's, losses[1] += contact's [J], losses[2] = lowest z after the last [m].
-
-    ``first_kick`` [s]: dt / 2 where x and v are synchronous, dt where v is half a step behind.
-    """
-    kick = first_kick
+@jit
+def run_steps(step, structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work):
+    """The loop of the functions below, for one step function."""
+    kick = load1(losses, 0) * 0.0 + first_kick
     for _ in range(steps):
-        power, lost, lowest = symplectic_euler_step(lattice_forces, structure, actuator_length, ground, dt, kick, x, v, f, memory)
+        power, lost, lowest = step(lattice_forces, structure, actuator_length, ground, dt, kick, x, v, f, memory, work)
         store1(losses, 0, fma(power, dt, load1(losses, 0)))
         store1(losses, 1, load1(losses, 1) + lost)
         store1(losses, 2, lowest)
-        kick = dt
+        kick = splat(dt, kick)
+
+
+@jit(cache=True)
+def symplectic_euler(structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work):
+    """See :func:`advance`."""
+    run_steps(symplectic_euler_step, structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work)
+
+
+@jit(cache=True)
+def velocity_verlet(structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work):
+    """See :func:`advance`."""
+    run_steps(velocity_verlet_step, structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work)
+
+
+@jit(cache=True)
+def runge_kutta(structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work):
+    """See :func:`advance`."""
+    run_steps(runge_kutta_step, structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work)
+
+
+INTEGRATORS = {"symplectic_euler": symplectic_euler, "velocity_verlet": velocity_verlet, "runge_kutta": runge_kutta}
+
+
+def advance(structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, integrator="symplectic_euler"):
+    """Step ``steps`` times in place; losses[0] += damping's, losses[1] += contact's [J], losses[2] = lowest z after the last [m].
+
+    ``first_kick`` [s] is for symplectic Euler: dt / 2 where x and v are synchronous, dt where v is half a step behind.
+    ``f`` must hold the forces at x for velocity Verlet.
+    """
+    work = np.zeros((4 * x.shape[0], *x.shape[1:]))
+    INTEGRATORS[integrator](structure, actuator_length, ground, dt, first_kick, steps, x, v, f, memory, losses, work)
