@@ -7,6 +7,7 @@ soft constraint there and not comparable with impulses.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -47,10 +48,12 @@ def to_mjcf(lattice: Lattice, design: Design, positions: Floats, *, gravity: Flo
 
     for (i, j), stiffness, natural in zip(structure.cables, structure.cable_stiffness, structure.cable_length, strict=True):
         spring(i, j, stiffness, natural, True)
-    for (i, j), rigidity, natural in zip(structure.actuators, structure.actuator_rigidity, structure.actuator_length, strict=True):
+    for (i, j), rigidity, natural in zip(
+        structure.actuators, structure.actuator_rigidity, structure.actuator_length, strict=True
+    ):
         spring(i, j, rigidity / natural, natural, True)
     for bar, stiffness, natural in zip(structure.bars, structure.segment_stiffness, structure.segment_length, strict=True):
-        for i, j in zip(bar[:-1], bar[1:], strict=True):
+        for i, j in pairwise(bar):
             spring(i, j, stiffness, natural, False)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode")

@@ -30,10 +30,10 @@ INTEGRATORS = {
 PRECISIONS = ("float64", "float32")
 #: Steps between two looks at rest, blow-up and frames.
 STRIDE = 32
-#: A lattice on the ground is quiet below this kinetic energy, over (total mass) g l.
-REST_ENERGY = 1e-5
-#: It is at rest when quiet for this share of sqrt(l / g).
-REST_TIME = 0.4
+#: A lattice is quiet below this kinetic energy over (total mass) g l: bars may tremble, but nothing can tip it over.
+REST_ENERGY = 1e-3
+#: It is at rest when quiet for this share of sqrt(l / g); what it still moves then is below 1 mm (docs/physics.md).
+REST_TIME = 1.0
 #: A take-off whose ballistic rise is below this share of l is no flight.
 LEAST_RISE = 1e-3
 #: Hops rolled out at once: bounds the memory for events to about 35 KB a hop.
@@ -115,10 +115,16 @@ def simulate(
 ) -> HopResult:
     """Hops of the lattice from the equilibria of ``stretches``, (n_actuators,) or (n, n_actuators).
 
-    All actuators are unlocked at once at time 0 and the hop is followed to rest, at most for ``scene.duration``. ``dt`` [s]
-    defaults to 0.8 of the critical step and may not exceed it unless ``allow_unstable``; ``integrator`` is one of
-    ``INTEGRATORS``; ``precision`` "float32" runs 16 lanes instead of 8 and rounds positions to 1e-7 m; ``trajectory_rate`` [Hz] asks for frames; ``equilibria`` saves finding them again.
-    ``progress`` is called with the number of hops newly ended. A hop that fails says so in ``status``, its neighbours go on.
+    All actuators are unlocked at once at time 0 and the hop is followed to rest, at most for ``scene.duration``.
+
+    * ``dt`` [s] defaults to 0.8 of the critical step and may not exceed that one unless ``allow_unstable``.
+    * ``integrator`` is one of ``INTEGRATORS``.
+    * ``precision`` "float32" runs 16 lanes instead of 8 and rounds positions to about 1e-7 m.
+    * ``trajectory_rate`` [Hz] asks for frames; it changes nothing else.
+    * ``equilibria`` saves finding them again (and then ``stretches`` are not looked at).
+    * ``progress`` is called with the number of hops newly ended.
+
+    A hop that fails says so in ``status`` (see ``describe_failures``); its neighbours go on.
 
     Raises InvalidStretchesError and InvalidParameterError.
     """
