@@ -121,7 +121,7 @@ def simulate(
     * ``integrator`` is one of ``INTEGRATORS``.
     * ``precision`` "float32" runs 16 lanes instead of 8 and rounds positions to about 1e-7 m.
     * ``trajectory_rate`` [Hz] asks for frames; it changes nothing else.
-    * ``equilibria`` saves finding them again (and then ``stretches`` are not looked at).
+    * ``equilibria`` of the same ``stretches`` save finding them again.
     * ``progress`` is called with the number of hops newly ended.
 
     A hop that fails says so in ``status`` (see ``describe_failures``); its neighbours go on.
@@ -131,6 +131,8 @@ def simulate(
     design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
     if equilibria is None:
         equilibria = form_find(stretches, design=design, scene=scene, lattice=lattice, threads=threads)
+    elif np.shape(np.atleast_2d(stretches)) != equilibria.stretches.shape or not np.allclose(stretches, equilibria.stretches):
+        raise InvalidParameterError("simulate: expected the stretches that the equilibria were found for, got others")
     if integrator not in INTEGRATORS:
         raise InvalidParameterError(f"simulate: expected integrator in {sorted(INTEGRATORS)}, got {integrator!r}")
     if precision not in PRECISIONS:
@@ -138,11 +140,14 @@ def simulate(
     step = _time_step(dt, design, lattice, integrator, allow_unstable)
     rate = 0.0 if trajectory_rate is None else _positive("trajectory_rate", trajectory_rate)
     structure = design.structure(lattice)
-    settings = _settings(structure, equilibria, scene, design, step, INTEGRATORS[integrator][1], rate)
+    settings = _settings(structure, scene, design, step, INTEGRATORS[integrator][1], rate)
+    # whatever the bars give back, kinetic energy stays below it plus the fall; ten times that is no physics
+    weight = structure.mass.sum() * scene.gravity
+    runaway = 10.0 * (equilibria.stored_energy + weight * (design.cell_height + scene.gravity * scene.duration**2))
     parts = []
     for first in range(0, len(equilibria.stretches), CHUNK):
         chunk = slice(first, first + CHUNK)
-        records = _records(equilibria.positions[chunk], equilibria.converged[chunk], settings)
+        records = _records(equilibria.positions[chunk], equilibria.converged[chunk], runaway[chunk], settings)
         _roll_out(INTEGRATORS[integrator][0], structure, scene, settings, records, threads, progress, np.dtype(precision))
         parts.append(_measure(records, structure, scene, lattice, settings.lag * settings.dt))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -180,12 +185,9 @@ def _positive(name: str, value: float) -> float:
     return float(value)
 
 
-def _settings(
-    structure: Structure, equilibria: Equilibria, scene: Scene, design: Design, dt: float, lag: float, rate: float
-) -> kernel.HopSettings:
+def _settings(structure: Structure, scene: Scene, design: Design, dt: float, lag: float, rate: float) -> kernel.HopSettings:
     weight_height = structure.mass.sum() * scene.gravity * design.cell_height
     blocks = int(np.ceil(scene.duration / dt / STRIDE))
-    stored = float(np.max(equilibria.stored_energy, initial=0.0))
     return kernel.HopSettings(
         dt=dt,
         lag=lag,
@@ -193,14 +195,12 @@ def _settings(
         stride=STRIDE,
         rest_energy=REST_ENERGY * weight_height,
         rest_steps=int(np.ceil(REST_TIME * np.sqrt(design.cell_height / scene.gravity) / dt)),
-        # whatever the bars give back, kinetic energy stays below it plus the fall; ten times that is no physics
-        runaway_energy=10.0 * (stored + weight_height + structure.mass.sum() * scene.gravity**2 * scene.duration**2),
         flight_speed=float(np.sqrt(2 * scene.gravity * LEAST_RISE * design.cell_height)),
         frame_stride=max(1, round(1.0 / (rate * dt * STRIDE))) * STRIDE if rate else 0,
     )
 
 
-def _records(positions: Floats, converged: np.ndarray, settings: kernel.HopSettings) -> kernel.HopRecords:
+def _records(positions: Floats, converged: np.ndarray, runaway_energy: Floats, settings: kernel.HopSettings) -> kernel.HopRecords:
     n, m = positions.shape[:2]
     frames = settings.max_steps // settings.frame_stride if settings.frame_stride else 0
     state = np.zeros((n, 4, 2, m, 3))
@@ -212,6 +212,7 @@ def _records(positions: Floats, converged: np.ndarray, settings: kernel.HopSetti
         touchdown_shift=np.zeros(n),
         height=np.zeros(n),
         steps=np.zeros(n, dtype=np.int64),
+        runaway_energy=runaway_energy,
         status=np.where(converged, -1, int(HopStatus.NOT_CONVERGED)),
         failed_mass=np.full(n, -1, dtype=np.int64),
         frame_positions=np.zeros((n, frames, m, 3)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -59,8 +60,17 @@ def critical_time_step(structure: Structure, positions: Floats) -> float:
     return float(brentq(excess, 1e-4 * undamped, undamped * (1 + 1e-5), rtol=1e-6))
 
 
+def round_down(value: float, digits: int = 3) -> float:
+    """``value`` > 0 cut to ``digits`` significant digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
+    return float(f"{math.floor(value / unit * (1 + 1e-12)) * unit:.{digits}g}")
+
+
 @lru_cache(maxsize=64)
 def default_time_step(design: Design, lattice: Lattice) -> float:
-    """MARGIN times the critical step of the unloaded lattice [s]."""
+    """MARGIN times the critical step of the unloaded lattice [s].
+
+    Cut to three digits, so that the eigenvalue solver's last digits, which differ between machines, move no landing.
+    """
     structure = design.structure(lattice)
-    return MARGIN * critical_time_step(structure, design.unloaded_positions(lattice))
+    return round_down(MARGIN * critical_time_step(structure, design.unloaded_positions(lattice)))

@@ -28,7 +28,6 @@ class HopSettings(NamedTuple):
     stride: int  #: steps between two looks at rest, blow-up and frames
     rest_energy: float  #: kinetic energy below which a lattice on the ground counts as quiet [J]
     rest_steps: int  #: how long it must stay quiet [steps]
-    runaway_energy: float  #: kinetic energy that no sane hop reaches [J]
     flight_speed: float  #: vertical speed of the centre of mass from which leaving the ground counts as take-off [m/s]
     frame_stride: int  #: steps between two frames, a multiple of ``stride``; 0 for no frames
 
@@ -42,6 +41,7 @@ class HopRecords(NamedTuple):
     touchdown_shift: np.ndarray  #: from the touchdown state back to the instant of contact [s], shape (n,)
     height: np.ndarray  #: highest z of the centre of mass [m], shape (n,)
     steps: np.ndarray  #: steps taken, shape (n,)
+    runaway_energy: np.ndarray  #: kinetic energy that no sane hop reaches [J], shape (n,)
     status: np.ndarray  #: HopStatus, shape (n,)
     failed_mass: np.ndarray  #: the mass that ran away in an unstable hop, else -1, shape (n,)
     frame_positions: np.ndarray  #: [m], shape (n, n_frames, n_masses, 3); n_frames is 0 without frames
@@ -215,10 +215,10 @@ def save_frame(settings, lanes, lane, records, hop, time):
 
 
 @jit(forceinline=False)
-def verdict(settings, lanes, lane, step, quiet, flown):
+def verdict(settings, lanes, lane, runaway_energy, step, quiet, flown):
     """HopStatus with which a lane's hop ends now, or -1 while it goes on."""
     kinetic = lanes.scalars[KINETIC, lane]
-    if not kinetic < settings.runaway_energy:  # also true of NaN
+    if not kinetic < runaway_energy:  # also true of NaN
         return UNSTABLE
     if quiet >= settings.rest_steps:
         return RESTED if flown else NO_FLIGHT
@@ -346,7 +346,8 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
                 continue
             if frames_due and step[lane] % settings.frame_stride == 0:
                 save_frame(settings, lanes, lane, records, hop[lane], step[lane] * dt)
-            status = verdict(settings, lanes, lane, step[lane], quiet[lane], flown[lane])
+            limit = records.runaway_energy[hop[lane]]
+            status = verdict(settings, lanes, lane, limit, step[lane], quiet[lane], flown[lane])
             if status < 0:
                 continue
             end_hop(settings, lanes, lane, records, hop[lane], status, step[lane], flown[lane])
