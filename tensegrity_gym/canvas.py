@@ -1,4 +1,4 @@
-"""A picture under way: a camera, the ground, shadows and members in metres, drawn with Pillow."""
+"""A picture under way: a camera, the ground, shadows and members in metres; Pillow draws what stays, kernels what moves."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from PIL import Image, ImageDraw, ImageFilter, ImageFont
+from PIL import Image, ImageDraw, ImageFont
 from scipy.interpolate import CubicSpline
 
+from tensegrity_gym import raster
+from tensegrity_gym.energies import member_forces
 from tensegrity_gym.types import Floats, Structure
 
 Colour = tuple[int, int, int]
-SKY, HORIZON, SAND, GRID = (236, 242, 248), (250, 251, 252), (226, 219, 206), (206, 197, 181)
-STRAIGHT, BOWED, ACTUATOR = (38, 70, 118), (214, 64, 69), (242, 140, 40)
-TAUT, SLACK, NODE, INK, TRAIL, TARGET = (
-    (66, 138, 124),
-    (178, 190, 196),
-    (32, 38, 52),
-    (52, 60, 74),
-    (120, 110, 150),
-    (200, 30, 80),
-)
-#: Bow (largest distance from the chord over length) from which a bar is drawn fully red [-].
-FULL_BOW = 0.15
+SKY, HORIZON, SAND, GRID, SHADE = (236, 242, 248), (250, 251, 252), (226, 219, 206), (206, 197, 181), (92, 84, 76)
+#: Bars from no load (or tension) over half to the full critical load.
+BAR_COLOURS: tuple[Colour, ...] = ((38, 70, 118), (126, 84, 142), (222, 52, 58))
+#: Cables: slack, barely taut, and at FULL_TENSION.
+SLACK = (186, 196, 202)
+CABLE_COLOURS: tuple[Colour, ...] = ((126, 184, 160), (20, 104, 92))
+ACTUATOR, ACTUATOR_SLACK = (242, 140, 40), (236, 206, 172)
+NODE, INK, TRAIL, TARGET = (32, 38, 52), (52, 60, 74), (120, 110, 150), (200, 30, 80)
+#: Tension from which a cable is drawn in its darkest colour [critical loads of a bar].
+FULL_TENSION = 2.0
 #: Drawn thicknesses [m]; members are drawn thicker than they are, to be seen.
 BAR_WIDTH, CABLE_WIDTH, ACTUATOR_WIDTH, NODE_RADIUS = 0.014, 0.005, 0.012, 0.011
 #: Where the light comes from: horizontal displacement of a shadow per height [-].
 LIGHT = (0.35, 0.25)
-#: Pictures are drawn this many times larger and reduced, against jagged lines.
+#: The background is drawn this many times larger and reduced, against jagged lines.
 SUPERSAMPLING = 2
 
 
@@ -67,103 +67,104 @@ class Camera:
 class Canvas:
     """A picture under way: everything is given in metres and drawn through the camera."""
 
-    def __init__(self, size: tuple[int, int], camera: Camera) -> None:
-        self.size = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
+    def __init__(self, size: tuple[int, int], camera: Camera, legend: bool = False) -> None:
+        self.size = size
         self.camera = camera
-        self.pixels_per_metre = self.size[0] / camera.width
-        self.image = _background(self.size, camera).copy()
-        self.draw = ImageDraw.Draw(self.image)
+        self.pixels_per_metre = size[0] / camera.width
+        self.pixels = (_legend_background if legend else _background)(size, camera).copy()
 
-    def project(self, points: Floats) -> list[tuple[float, float]]:
-        """Pixels of points, shape (n, 3) [m]."""
-        return _corners(self.camera.project(points, self.size)[0])
+    def project(self, points: Floats) -> Floats:
+        """Pixels, shape (n, 2), of points, shape (n, 3) [m]."""
+        return self.camera.project(points, self.size)[0]
 
-    def line_width(self, metres: float) -> int:
-        return max(round(metres * self.pixels_per_metre), SUPERSAMPLING)
+    def strokes(self, ends: Floats, metres: ArrayLike, colour: ArrayLike) -> None:
+        """Strokes between pixels (n, 4), as wide as so many metres at the centre, (n,) or one, in colours (n, 3) or one."""
+        radius = np.broadcast_to(np.asarray(metres, dtype=float) * (0.5 * self.pixels_per_metre), len(ends))
+        colours = np.broadcast_to(np.asarray(colour, dtype=float), (len(ends), 3))
+        raster.draw_strokes(self.pixels, np.ascontiguousarray(ends), np.ascontiguousarray(radius), np.ascontiguousarray(colours))
 
     def shadow(self, positions: Floats, structure: Structure) -> None:
         """The bars' shadow on the ground, softer the higher the lattice is."""
-        curves = bar_curves(positions, structure)
-        curves = curves - curves[..., 2:] * np.array((LIGHT[0], LIGHT[1], 1.0))
-        pixels, _ = self.camera.project(curves, self.size)
+        masses = positions[structure.bars]
+        pixels = self.project(masses - masses[..., 2:] * np.array((LIGHT[0], LIGHT[1], 1.0)))
         if pixels[..., 1].min() > self.size[1]:
             return
-        mask = Image.new("L", self.size)
-        pen = ImageDraw.Draw(mask)
-        for curve in pixels:
-            pen.line(_corners(curve), fill=105, width=self.line_width(2.2 * BAR_WIDTH), joint="curve")
         height = max(float(positions[:, 2].min()), 0.0)
-        blur = (0.012 + 0.02 * min(height, 1.5)) * self.pixels_per_metre
-        self.image.paste((92, 84, 76), mask=mask.filter(ImageFilter.BoxBlur(blur)))
+        soft = max((0.012 + 0.02 * min(height, 1.5)) * self.pixels_per_metre, 0.5)
+        mask = np.zeros(self.pixels.shape[:2], dtype=np.float32)
+        radius = 1.1 * BAR_WIDTH * self.pixels_per_metre
+        raster.draw_shade(self.pixels, mask, _pairs(pixels), radius, soft, np.array(SHADE, dtype=float), 0.4)
 
     def lattice(self, positions: Floats, structure: Structure, actuator_length: Floats | None = None) -> None:
-        """Members and nodes, the far ones first and paler."""
+        """Members and nodes, the far ones first and paler; bars coloured by load, cables by tension."""
         pixels, near = self.camera.project(positions, self.size)
-        curves = self.camera.project(bar_curves(positions, structure), self.size)[0]
-        paleness = 0.62 * (near.max() - near) / (float(np.ptp(near)) or 1.0)
+        curves = _pairs(self.project(bar_curves(positions, structure))).reshape(len(structure.bars), -1, 4)
         rest = structure.actuator_length if actuator_length is None else actuator_length
-        items: list[tuple[float, Floats, Colour, float]] = []
-        bow = np.minimum(bar_bow(positions, structure) / FULL_BOW, 1.0)
-        for curve, share, pale in zip(curves, bow, paleness[structure.bars].mean(axis=1), strict=True):
-            items.append((pale, curve, _mix(STRAIGHT, BOWED, share), BAR_WIDTH))
-        for members, natural, colours, widths in (
-            (structure.cables, structure.cable_length, (SLACK, TAUT), (CABLE_WIDTH, CABLE_WIDTH)),
-            (structure.actuators, rest, (ACTUATOR, ACTUATOR), (CABLE_WIDTH, ACTUATOR_WIDTH)),
-        ):
-            taut = _taut(positions, members, natural)
-            for ends, pale, tight in zip(pixels[members], paleness[members].mean(axis=1), taut, strict=True):
-                items.append((pale, ends, colours[int(tight)], widths[int(tight)]))
-        for pale, points, colour, metres in sorted(items, key=lambda item: -item[0]):
-            self.draw.line(
-                points.ravel().tolist(), fill=_mix(colour, HORIZON, pale), width=self.line_width(metres), joint="curve"
-            )
-        nodes = np.unique(structure.bars[:, [0, -1]])
-        r = NODE_RADIUS * self.pixels_per_metre
-        for node in nodes[np.argsort(near[nodes])]:
-            x, y = pixels[node]
-            self.draw.ellipse((x - r, y - r, x + r, y + r), fill=_mix(NODE, HORIZON, paleness[node]))
+        load, tension, pull = member_loads(positions, structure, rest)
+        paleness = 0.62 * (near.max() - near) / (float(np.ptp(near)) or 1.0)
+        pieces, inner = curves.shape[1], structure.bars
+        nodes = np.unique(inner[:, [0, -1]])
+        ends = [curves.reshape(-1, 4), pixels[structure.cables].reshape(-1, 4), pixels[structure.actuators].reshape(-1, 4)]
+        ends.append(np.concatenate([pixels[nodes], pixels[nodes]], axis=1))
+        pale = [np.repeat(paleness[inner].mean(axis=1), pieces), paleness[structure.cables].mean(axis=1)]
+        pale += [paleness[structure.actuators].mean(axis=1), paleness[nodes] - 1e-9]
+        colour = [np.repeat(_shades(BAR_COLOURS, load), pieces, axis=0)]
+        colour += [np.where(tension[:, None] > 0, _shades(CABLE_COLOURS, tension / FULL_TENSION), SLACK)]
+        colour += [np.where(pull[:, None] > 0, ACTUATOR, ACTUATOR_SLACK), np.tile(NODE, (len(nodes), 1))]
+        width = [np.full(len(ends[0]), BAR_WIDTH), np.where(tension > 0, CABLE_WIDTH, 0.7 * CABLE_WIDTH)]
+        width += [np.where(pull > 0, ACTUATOR_WIDTH, CABLE_WIDTH), np.full(len(nodes), 2 * NODE_RADIUS)]
+        far = np.concatenate(pale)
+        mixed = np.concatenate(colour) + far[:, None] * (np.array(HORIZON) - np.concatenate(colour))
+        order = np.argsort(-far, kind="stable")
+        self.strokes(np.concatenate(ends)[order], np.concatenate(width)[order], mixed[order])
 
     def target(self, point: ArrayLike) -> None:
-        """Rings on the ground around the target, of 4 and 8 cm radius."""
+        """Rings on the ground around the target, of 4 and 8 cm radius or, seen from afar, 6 and 12 pixels."""
         turn = np.linspace(0, 2 * np.pi, 49)
         middle = np.array((*np.asarray(point, dtype=float)[:2], 0.0))
         for radius in (0.04, 0.08):
+            radius = max(radius, 150 * radius / self.pixels_per_metre)
             ring = middle + radius * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-            self.draw.line(self.project(ring), fill=TARGET, width=self.line_width(0.01), joint="curve")
+            self.strokes(_pairs(self.project(ring)), max(0.01, 1.6 / self.pixels_per_metre), TARGET)
 
     def trail(self, path: Floats, dot: float = 0.009, every: float = 0.06) -> None:
-        """Dots ``every`` metres along a path, shape (n, 3) [m]."""
+        """Dots ``every`` metres along a path, shape (n, 3) [m]; seen from afar, fewer."""
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-        at = np.arange(0.0, along[-1], every)
-        dots = np.column_stack([np.interp(at, along, path[:, k]) for k in range(3)])
-        r = dot * self.pixels_per_metre
-        for x, y in self.project(dots):
-            self.draw.ellipse((x - r, y - r, x + r, y + r), fill=TRAIL)
+        at = np.arange(0.0, along[-1], max(every, 6 / self.pixels_per_metre))
+        dots = self.project(np.column_stack([np.interp(at, along, path[:, k]) for k in range(3)]))
+        self.strokes(np.concatenate([dots, dots], axis=1), max(2 * dot, 2.2 / self.pixels_per_metre), TRAIL)
 
-    def text(self, where: tuple[float, float], words: str, height: int, colour: Colour = INK, anchor: str = "ma") -> None:
-        """Words at ``where``, in fractions of the picture's width and height."""
-        x, y = where[0] * self.size[0], where[1] * self.size[1]
-        self.draw.text((x, y), words, fill=colour, font=_font(height * SUPERSAMPLING), anchor=anchor)
+    def text(self, where: tuple[float, float], words: str, height: int, colour: Colour = INK, left: bool = False) -> None:
+        """Words whose top is at ``where``, in fractions of the picture's width and height: centred, or ``left`` aligned."""
+        glyphs = [_glyph(letter, height) for letter in words]
+        x = where[0] * self.size[0] - (0.0 if left else 0.5 * sum(glyph[3] for glyph in glyphs))
+        ink = np.array(colour, dtype=float)
+        for cover, dx, dy, advance in glyphs:
+            raster.draw_mask(self.pixels, cover, round(x) + dx, round(where[1] * self.size[1]) + dy, ink)
+            x += advance
 
     def array(self) -> np.ndarray:
         """The finished picture, shape (h, w, 3) uint8."""
-        return np.array(self.image.reduce(SUPERSAMPLING))
+        return self.pixels
+
+
+def member_loads(positions: Floats, structure: Structure, actuator_length: Floats) -> tuple[Floats, Floats, Floats]:
+    """Elastic loads over a bar's critical load [-]: bars (compression > 0), cables and actuated cables (tension > 0).
+
+    Positions (n_masses, 3) [m]; shapes (n_bars,), (n_cables,), (n_actuators,).
+    """
+    forces = member_forces(structure, positions[None], np.asarray(actuator_length, dtype=float)[None])
+    segments = structure.bars.shape[1] - 1
+    hinges = np.maximum(segments, 2)
+    critical = structure.hinge_stiffness * (2 * np.sin(np.pi / (2 * hinges))) ** 2 / structure.segment_length
+    critical = np.where(critical > 0, critical, 1.0)
+    typical = float(critical.mean())
+    return forces.bars[0] / critical, forces.cables[0] / typical, forces.actuators[0] / typical
 
 
 def bar_curves(positions: Floats, structure: Structure, samples: int = 4) -> Floats:
     """Points along each bar, ``samples`` per segment, shape (n_bars, n_points, 3) [m]."""
     return np.einsum("pm,bmk->bpk", _spline(structure.bars.shape[1], samples), positions[structure.bars])
-
-
-def bar_bow(positions: Floats, structure: Structure) -> Floats:
-    """Largest distance of a bar's masses from its chord, over the bar's length, shape (n_bars,) [-]."""
-    along = positions[structure.bars]
-    start, chord = along[:, :1], along[:, -1:] - along[:, :1]
-    chord = chord / np.maximum(np.linalg.norm(chord, axis=-1, keepdims=True), 1e-12)
-    off = along - start
-    off = off - (off * chord).sum(axis=-1, keepdims=True) * chord
-    length = structure.segment_length * (structure.bars.shape[1] - 1)
-    return np.linalg.norm(off, axis=-1).max(axis=1) / length
 
 
 @lru_cache(maxsize=8)
@@ -175,22 +176,47 @@ def _spline(masses: int, samples: int) -> Floats:
     return np.asarray(CubicSpline(np.arange(masses), np.eye(masses), bc_type="natural")(at))
 
 
-def _taut(positions: Floats, pairs: np.ndarray, natural_length: Floats) -> np.ndarray:
-    length = np.linalg.norm(positions[pairs[:, 1]] - positions[pairs[:, 0]], axis=1)
-    return length > natural_length * (1 + 1e-6)
+def _shades(colours: tuple[Colour, ...], share: Floats) -> Floats:
+    """Colours (n, 3) at shares (n,) of the way through ``colours``; beyond its ends, the ends."""
+    at = np.linspace(0, 1, len(colours))
+    return np.column_stack([np.interp(share, at, channel) for channel in np.array(colours, dtype=float).T])
 
 
-def _mix(a: Colour, b: Colour, share: float) -> Colour:
-    return (
-        round(a[0] + share * (b[0] - a[0])),
-        round(a[1] + share * (b[1] - a[1])),
-        round(a[2] + share * (b[2] - a[2])),
-    )
+def _pairs(points: Floats) -> Floats:
+    """Strokes (n, 4) between consecutive pixels of curves, shape (..., n_points, 2)."""
+    return np.concatenate([points[..., :-1, :], points[..., 1:, :]], axis=-1).reshape(-1, 4)
+
+
+@lru_cache(maxsize=1024)
+def _glyph(letter: str, height: int) -> tuple[np.ndarray, int, int, float]:
+    """A letter as a mask (h, w) uint8, where its corner lies from its top left anchor, and its width [pixels]."""
+    font = _font(height)
+    left, top, right, bottom = (int(edge) for edge in font.getbbox(letter))
+    mask = Image.new("L", (max(right - left, 0) + 2, max(bottom - top, 0) + 2))
+    ImageDraw.Draw(mask).text((1 - left, 1 - top), letter, fill=255, font=font)
+    return np.array(mask), left - 1, top - 1, float(font.getlength(letter))
 
 
 @lru_cache(maxsize=4)
-def _background(size: tuple[int, int], camera: Camera, spacing: float = 0.5) -> Image.Image:
-    """Sky, and a strip of ground across the picture with a grid of squares of ``spacing`` [m]."""
+def _legend_background(size: tuple[int, int], camera: Camera) -> np.ndarray:
+    """The background, and in its lower left corner what the colours of bars and cables mean."""
+    canvas = Canvas(size, camera)
+    height = max(size[1] // 40, 9)
+    scales = ((BAR_COLOURS, "bars: load / critical load, 0 to 1"), (CABLE_COLOURS, "cables: tension; pale: slack"))
+    for row, (colours, words) in enumerate(scales):
+        y = size[1] - (2.8 - 1.5 * row) * height
+        x = np.linspace(height, 5 * height, 25)
+        ends = np.column_stack([x[:-1], np.full(24, y), x[1:], np.full(24, y)])
+        canvas.strokes(ends, 0.45 * height / canvas.pixels_per_metre, _shades(colours, np.linspace(0, 1, 24)))
+        canvas.text((5.8 * height / size[0], (y - 0.6 * height) / size[1]), words, height, left=True)
+    return canvas.pixels
+
+
+@lru_cache(maxsize=4)
+def _background(final: tuple[int, int], camera: Camera) -> np.ndarray:
+    """Sky, and a strip of ground across the picture with a grid of squares, shape (h, w, 3) uint8."""
+    size = (final[0] * SUPERSAMPLING, final[1] * SUPERSAMPLING)
+    spacing = 0.5 if camera.width < 8 else 2.0 if camera.width < 32 else 10.0
     down = np.linspace(0, 1, size[1])[:, None, None]
     column = np.array(SKY) + np.minimum(1.4 * down, 1.0) * (np.array(HORIZON) - np.array(SKY))
     picture = Image.fromarray(np.broadcast_to(column, (size[1], size[0], 3)).astype(np.uint8))
@@ -212,7 +238,7 @@ def _background(size: tuple[int, int], camera: Camera, spacing: float = 0.5) -> 
     rows = np.clip((np.arange(size[1]) - top) / (0.09 * size[1]), 0, 1)
     fade = Image.fromarray(np.repeat((255 * rows).astype(np.uint8)[:, None], size[0], axis=1))
     picture.paste(ground, mask=Image.composite(fade, Image.new("L", size), mask))
-    return picture
+    return np.array(picture.reduce(SUPERSAMPLING))
 
 
 def _ground_strip(size: tuple[int, int], camera: Camera) -> Floats:

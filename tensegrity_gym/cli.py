@@ -8,8 +8,9 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from tqdm import tqdm
 
-from tensegrity_gym import task
+from tensegrity_gym import reachable
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, OutputFolderError, TensegrityError
 from tensegrity_gym.lattice import Lattice
@@ -44,9 +45,9 @@ def hop(
     if picture is not None and result.trajectory is not None:
         from PIL import Image
 
-        from tensegrity_gym.render import filmstrip
+        from tensegrity_gym.render import filmstrip, whole_hop
 
-        Image.fromarray(filmstrip(result.trajectory)).save(picture)
+        Image.fromarray(filmstrip(whole_hop(result))).save(picture)
         print(f"picture: {picture}")
     if video is not None:
         from tensegrity_gym.render import record_hop
@@ -82,20 +83,25 @@ def info() -> None:
             print(f"  {name:<26} {value}")
 
 
-def reach(scene: str = "earth", hops: int = 256, seed: int = 0) -> None:
-    """Measure how far hops go: the disc that holds 95 % of the landings of hops with Sobol stretches.
+def reach(scene: str = "earth", hops: int = 256, seed: int = 0, save: bool = False) -> None:
+    """Measure how far hops go: where hops with Sobol stretches land.
 
     Args:
         scene: name of a scene preset.
         hops: how many hops to simulate.
         seed: of the Sobol sequence.
+        save: replace the reach that the package stores for this preset, which targets and rewards follow.
     """
-    for landing, measured in task.measure_reach(Scene.preset(scene), hops, seed).items():
-        documented = task.REACHES[scene][landing]
+    with tqdm(total=hops, desc=f"hops, {scene}", unit="hop") as bar:
+        measured = reachable.measure_reach(Scene.preset(scene), hops, seed, bar.update)
+    for landing, found in measured.items():
+        stored = reachable.stored_reach(scene, landing)
         print(
-            f"{scene:<6} {landing:<9}  radius {measured.radius:.3f} m, downhill {measured.downhill:.3f} m   "
-            f"(documented: {documented.radius:.3f} m, {documented.downhill:.3f} m)"
+            f"{scene:<6} {landing:<9}  radius {found.radius:.3f} m, boundary {min(found.boundary):.3f} to "
+            f"{max(found.boundary):.3f} m, downhill {found.downhill:.3f} m   (stored: radius {stored.radius:.3f} m)"
         )
+    if save:
+        print(f"saved: {reachable.save_reach(scene, measured, hops, seed)}")
 
 
 def summary(result: HopResult, scene: Scene) -> str:

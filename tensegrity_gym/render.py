@@ -1,7 +1,8 @@
 """Pictures and videos of postures and hops, drawn with Pillow: no window, no graphics card.
 
 Bars are drawn as the natural cubic spline through their masses (a pinned rod has no moment at its ends) and turn from
-blue to red as they bow; cables are green while taut and pale while slack; actuated cables are orange.
+blue to red as their load nears the critical one; cables are green, the darker the tenser, and pale while slack; actuated
+cables are orange.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.simulate import Trajectory, simulate
+from tensegrity_gym.simulate import HopResult, Trajectory, simulate
 from tensegrity_gym.types import Floats, Structure
 
+#: Size of a frame of a film, by default [pixels].
+FRAME_SIZE = (640, 480)
 #: A lattice whose lowest mass is above this is off the ground [m].
 ALOFT = 1e-3
 
@@ -35,22 +38,27 @@ def draw_posture(
     size: tuple[int, int] = (960, 720),
     actuator_length: ArrayLike | None = None,
     target: ArrayLike | None = None,
+    trail: ArrayLike | None = None,
     caption: str | None = None,
+    legend: bool = False,
 ) -> np.ndarray:
     """Draw one posture, positions of shape (n_masses, 3) [m]; returns a picture of shape (h, w, 3), uint8.
 
-    ``target`` [m], shape (2,), is a point on the ground. ``actuator_length`` [m], shape (n_actuators,), are the actuated
-    cables' rest lengths (default: unlocked).
+    ``target`` [m], shape (2,), is a point on the ground; ``trail`` [m], shape (n, 3), a path that is dotted; ``legend`` says
+    what the colours mean. ``actuator_length`` [m], shape (n_actuators,), are the actuated cables' rest lengths (default:
+    unlocked).
     """
     structure = _structure(lattice or Lattice(2, 2), design or Design())
     points = check_positions(positions, structure, 2)
-    canvas = Canvas(size, camera or Camera())
+    canvas = Canvas(size, camera or Camera(), legend)
     if target is not None:
         canvas.target(target)
     canvas.shadow(points, structure)
+    if trail is not None and len(np.asarray(trail)) > 1:
+        canvas.trail(np.asarray(trail, dtype=float))
     canvas.lattice(points, structure, None if actuator_length is None else np.asarray(actuator_length, dtype=float))
     if caption:
-        canvas.text((0.5, 0.93), caption, height=max(size[1] // 30, 10))
+        canvas.text((0.5, 0.03), caption, height=max(size[1] // 26, 10))
     return canvas.array()
 
 
@@ -149,7 +157,7 @@ def record_hop(
     target: ArrayLike | None = None,
     fps: int = 30,
     speed: float = 0.5,
-    size: tuple[int, int] = (640, 640),
+    size: tuple[int, int] = FRAME_SIZE,
 ) -> Path:
     """Simulate one hop and write it as ``.gif`` or ``.mp4`` (which needs the extra "video"); returns the path.
 
@@ -164,35 +172,58 @@ def record_hop(
     scene, design, lattice = scene or Scene(), design or Design(), lattice or Lattice(2, 2)
     one = np.atleast_2d(np.asarray(stretches, dtype=float))[:1]
     hop = simulate(one, scene=scene, design=design, lattice=lattice, trajectory_rate=fps / speed)
-    assert hop.trajectory is not None  # it was asked for
-    frames = int(hop.trajectory.frames[0])
-    points, times = hop.trajectory.positions[0][:frames], hop.trajectory.times[0][:frames]
-    camera = watching_camera(points, size)
+    trajectory = whole_hop(hop)
     if target is not None:  # targets are relative to where the centre of mass started
-        target = np.asarray(target, dtype=float) + _centre_of_mass(points[:1], _structure(lattice, design))[0, :2]
-    pictures = []
-    for k in range(frames):
-        held = one[0] * design.cell_height if k == 0 else None
-        caption = f"{times[k]:.2f} s"
-        pictures.append(
-            draw_posture(
-                points[k],
-                lattice=lattice,
-                design=design,
-                camera=camera,
-                size=size,
-                actuator_length=held,
-                target=target,
-                caption=caption,
-            )
-        )
+        start = trajectory.positions[0, :1]
+        target = np.asarray(target, dtype=float) + _centre_of_mass(start, _structure(lattice, design))[0, :2]
+    pictures = hop_frames(trajectory, lattice=lattice, design=design, size=size, target=target)
     _write_video(pictures, path, fps)
     return path
 
 
-def watching_camera(positions: Floats, size: tuple[int, int]) -> Camera:
-    """A camera that has all of a hop in view, positions of shape (f, n_masses, 3) [m]."""
+def hop_frames(
+    trajectory: Trajectory,
+    *,
+    hop: int = 0,
+    lattice: Lattice | None = None,
+    design: Design | None = None,
+    camera: Camera | None = None,
+    size: tuple[int, int] = FRAME_SIZE,
+    target: ArrayLike | None = None,
+) -> list[np.ndarray]:
+    """All frames of a hop as pictures of shape (h, w, 3), uint8, with its trail, time and height of the centre of mass.
+
+    ``target`` [m], shape (2,), is a point on the ground. The camera (default) has the whole hop and the target in view.
+    """
+    lattice, design = lattice or Lattice(2, 2), design or Design()
+    structure = _structure(lattice, design)
+    frames = int(trajectory.frames[hop])
+    points, times = check_positions(trajectory.positions[hop][:frames], structure, 3), trajectory.times[hop][:frames]
+    com = _centre_of_mass(points, structure)
+    held = _held_lengths(points[0], structure)
+    camera = camera or watching_camera(points, size, target)
+    return [
+        draw_posture(
+            points[k],
+            lattice=lattice,
+            design=design,
+            camera=camera,
+            size=size,
+            actuator_length=held if times[k] <= 0 else None,
+            target=target,
+            trail=com[: k + 1],
+            caption=f"{times[k]:.2f} s      {com[k, 2]:.2f} m high",
+            legend=True,
+        )
+        for k in range(frames)
+    ]
+
+
+def watching_camera(positions: Floats, size: tuple[int, int], target: ArrayLike | None = None) -> Camera:
+    """A camera that has all of a hop, positions of shape (f, n_masses, 3) [m], and its target in view."""
     points = positions.reshape(-1, 3)
+    if target is not None:
+        points = np.concatenate([points, [(*np.asarray(target, dtype=float)[:2], 0.0)]])
     camera = Camera()
     seen = points @ camera.axes.T
     spread = np.ptp(seen[:, :2], axis=0)
@@ -202,11 +233,21 @@ def watching_camera(positions: Floats, size: tuple[int, int]) -> Camera:
     return replace(camera, centre=(x, y, z), width=float(width), distance=4 * float(width))
 
 
-def waiting_picture(lattice: Lattice, *, target: ArrayLike | None = None, size: tuple[int, int] = (2000, 560)) -> np.ndarray:
+def waiting_picture(
+    lattice: Lattice, *, target: ArrayLike | None = None, size: tuple[int, int] = (2000, 560), camera: Camera | None = None
+) -> np.ndarray:
     """The unloaded lattice standing on the ground, and the target: what there is to see before a hop; (h, w, 3) uint8."""
+    points = standing_positions(lattice)
+    camera = camera or watching_camera(points + (0, 0, 0.6), size, target)
+    return draw_posture(points, lattice=lattice, camera=camera, size=size, target=target)
+
+
+@lru_cache(maxsize=8)
+def standing_positions(lattice: Lattice) -> Floats:
+    """Positions of the unloaded lattice of the default design, standing on the ground, shape (n_masses, 3) [m]."""
     points = Design().unloaded_positions(lattice)
     points[:, 2] -= points[:, 2].min()
-    return draw_posture(points, lattice=lattice, camera=Camera(width=4.0), size=size, target=target)
+    return points
 
 
 def check_positions(positions: ArrayLike, structure: Structure, dimensions: int) -> Floats:
@@ -219,6 +260,17 @@ def check_positions(positions: ArrayLike, structure: Structure, dimensions: int)
     if not np.isfinite(points).all():
         raise InvalidParameterError("positions: expected finite numbers [m], got some that are not")
     return points
+
+
+def whole_hop(result: HopResult, hop: int = 0) -> Trajectory:
+    """One hop's frames, from the moment of release on; the result must have a trajectory."""
+    if result.trajectory is None:
+        raise InvalidParameterError("whole_hop: expected a hop with frames, got none; give simulate a trajectory_rate")
+    frames = int(result.trajectory.frames[hop])
+    first = (np.zeros(1), result.equilibria.positions[hop][None], result.energies[hop, :1])
+    later = (getattr(result.trajectory, name)[hop][:frames] for name in ("times", "positions", "energies"))
+    joined = [np.concatenate(pair)[None] for pair in zip(first, later, strict=True)]
+    return Trajectory(joined[0], joined[1], joined[2], np.array([frames + 1]))
 
 
 @lru_cache(maxsize=8)

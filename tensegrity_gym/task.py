@@ -1,108 +1,77 @@
-"""The landing task: where targets lie, what is observed, what is rewarded. Batched, pure, and written once.
+"""The landing task: where targets lie, what is observed, what is simulated and what is rewarded. Batched, written once.
 
-Every env calls these functions; none of them simulates except :func:`measure_reach`, which is how the table of reaches
-was made.
+Every env, single or vector, calls these functions and adds nothing of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import product
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
-from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.batch import thread_count
+from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
 from tensegrity_gym.formfinding import STRETCH_RANGE
+from tensegrity_gym.lattice import Lattice
+from tensegrity_gym.reachable import reach_of
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.simulate import simulate
+from tensegrity_gym.scene_ranges import SceneRanges
+from tensegrity_gym.simulate import HopResult, simulate
 from tensegrity_gym.types import Floats, HopStatus
 
-#: Reward of a hop that failed (unstable or not converged), and the least reward that any hop gets [reaches].
+#: Reward of a hop that failed (unstable or not converged), and the least reward that any hop gets [-].
 WORST_REWARD = -5.0
 #: An error of less than this is a success, by default [reaches].
 SUCCESS_RADIUS = 0.1
-#: Targets may be asked for up to this distance from the middle of the reachable disc [reaches].
+#: Targets may be asked for up to this distance from the middle of the reachable region [reaches].
 TARGET_LIMIT = 2.0
-#: Scene values that may be randomised, in the order in which they are observed, with units [m/s^2], [-], [rad].
-SCENE_VALUES = ("gravity", "friction", "slope")
-
-
-@dataclass(frozen=True)
-class Reach:
-    """The disc that holds 95 % of the landings of hops with stretches spread evenly over their range."""
-
-    radius: float
-    """95th percentile of the distance from the middle [m]."""
-    downhill: float = 0.0
-    """How far the middle, the mean landing, lies downhill of the start [m]."""
-
-
-#: Measured reaches of the default design's 2x2 lattice, by preset and by where the landing is read; made by
-#: ``python -m tensegrity_gym reach --scene NAME --hops 256``.
-REACHES: dict[str, dict[str, Reach]] = {
-    "earth": {"rest": Reach(1.766), "touchdown": Reach(0.156)},
-    "moon": {"rest": Reach(11.140), "touchdown": Reach(1.111)},
-    "mars": {"rest": Reach(5.454), "touchdown": Reach(0.491)},
-    "titan": {"rest": Reach(13.096), "touchdown": Reach(1.335)},
-    "slope": {"rest": Reach(3.422, downhill=1.705), "touchdown": Reach(0.383, downhill=0.461)},
-}
+#: Where targets may be drawn from: evenly from the reachable region, on its boundary, or from beyond it.
+TARGET_PLACES = ("inside", "boundary", "beyond")
+#: Targets from beyond lie between these multiples of the boundary's distance, but within TARGET_LIMIT.
+BEYOND = (1.1, 1.5)
+#: Named models of a hop, as arguments of ``simulate``: the paper's, or the same in single precision.
+FIDELITIES: dict[str, dict[str, Any]] = {"paper": {}, "single": {"precision": "float32"}}
+#: Arguments of ``simulate`` that a fidelity may be made of.
+LEVERS = ("dt", "integrator", "precision")
 
 _FAILED = (int(HopStatus.UNSTABLE), int(HopStatus.NOT_CONVERGED))
 
 
-def reach_of(scene: Scene) -> Reach:
-    """The documented reach of ``scene``: that of the preset most like it.
-
-    Alike is measured by slope first (flat or not), then by the ratio of gravities: a scene between the presets gets the
-    nearest one's reach, so that rewards in a randomised scene stay comparable.
-    """
-
-    def unlikeness(name: str) -> tuple[bool, float]:
-        preset = Scene.preset(name)
-        return (preset.slope > 0) != (scene.slope > 0), abs(float(np.log(preset.gravity / scene.gravity)))
-
-    return REACHES[min(REACHES, key=unlikeness)][scene.landing]
-
-
 def reach(scene: Scene) -> float:
-    """Radius of the reachable disc [m]: the unit of landing errors in ``scene``."""
+    """Radius of the disc that holds 95 % of the landings [m]: the unit of landing errors in ``scene``."""
     return reach_of(scene).radius
 
 
 def reachable_middle(scene: Scene) -> Floats:
-    """Middle of the reachable disc, relative to the start of the hop, shape (2,) [m]."""
+    """Middle of the reachable region, relative to the start of the hop, shape (2,) [m]."""
     return reach_of(scene).downhill * np.array((np.cos(scene.slope_direction), np.sin(scene.slope_direction)))
 
 
-def measure_reach(scene: Scene, hops: int = 256, seed: int = 0) -> dict[str, Reach]:
-    """Simulate ``hops`` hops with Sobol stretches; for "rest" and "touchdown", the disc that holds 95 % of landings."""
-    low, high = STRETCH_RANGE
-    sobol = qmc.Sobol(d=4, seed=seed).random_base2(int(np.ceil(np.log2(hops))))[:hops]
-    result = simulate(low + (high - low) * sobol, scene=scene)
-    landed = ~failed(result.status)
-    if not landed.any():
-        raise InvalidParameterError(f"measure_reach: expected at least one of {hops} hops to succeed in {scene}, none did")
-    return {
-        "rest": _disc_of(result.rest[landed], scene),
-        "touchdown": _disc_of(result.touchdown[landed & (result.flight_time > 0)], scene),
-    }
+def reachable(target: ArrayLike, scene: Scene) -> np.ndarray:
+    """True where a target lies in the reachable region of ``scene``, shapes (n, 2) -> (n,)."""
+    away = np.asarray(target, dtype=np.float64) - reachable_middle(scene)
+    direction = np.arctan2(away[..., 1], away[..., 0]) - (scene.slope_direction if scene.slope > 0 else 0.0)
+    return np.hypot(away[..., 0], away[..., 1]) <= reach_of(scene).distance(direction)
 
 
-def _disc_of(landing: Floats, scene: Scene) -> Reach:
-    direction = np.array((np.cos(scene.slope_direction), np.sin(scene.slope_direction)))
-    downhill = float(landing.mean(axis=0) @ direction) if scene.slope > 0 else 0.0
-    return Reach(float(np.quantile(np.linalg.norm(landing - downhill * direction, axis=1), 0.95)), downhill)
-
-
-def sample_targets(rng: np.random.Generator, n: int, scene: Scene) -> Floats:
-    """Targets drawn uniformly from the reachable disc of ``scene``, shape (n, 2) [m]."""
-    radius = reach(scene) * np.sqrt(rng.random(n))
-    angle = 2 * np.pi * rng.random(n)
-    return reachable_middle(scene) + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+def sample_targets(rng: np.random.Generator, n: int, scene: Scene, place: str = "inside") -> Floats:
+    """Targets drawn evenly from the reachable region of ``scene``, its boundary or beyond it, shape (n, 2) [m]."""
+    if place not in TARGET_PLACES:
+        raise InvalidParameterError(f"target: expected one of {TARGET_PLACES} or two numbers (x, y) [m], got {place!r}")
+    region = reach_of(scene)
+    share, depth = rng.random((n, 2)).T
+    direction = region.directions(share)
+    distance = region.distance(direction)
+    if place == "inside":
+        distance = distance * np.sqrt(depth)
+    elif place == "beyond":
+        distance = np.minimum(distance * (BEYOND[0] + (BEYOND[1] - BEYOND[0]) * depth), TARGET_LIMIT * region.radius)
+    angle = direction + (scene.slope_direction if scene.slope > 0 else 0.0)
+    return reachable_middle(scene) + distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def failed(status: ArrayLike) -> np.ndarray:
@@ -116,90 +85,121 @@ def landing_error(landing: ArrayLike, target: ArrayLike) -> Floats:
     return np.hypot(difference[..., 0], difference[..., 1])
 
 
-def reward(landing: ArrayLike, target: ArrayLike, status: ArrayLike, reach: ArrayLike) -> Floats:
-    """Minus the landing error over the reach, never below ``WORST_REWARD``, which failed hops get, shape (n,) [-]."""
-    error = landing_error(landing, target)
-    lost = failed(status) | ~np.isfinite(error)
-    return np.where(lost, WORST_REWARD, np.maximum(-np.where(lost, 0.0, error) / np.asarray(reach), WORST_REWARD))
-
-
 def success(landing: ArrayLike, target: ArrayLike, status: ArrayLike, radius: ArrayLike) -> np.ndarray:
     """True where a hop that did not fail landed within ``radius`` [m] of its target, shape (n,)."""
     return ~failed(status) & (landing_error(landing, target) <= np.asarray(radius))
 
 
 @dataclass(frozen=True)
-class SceneRanges:
-    """Scenes drawn at random: a base scene, and the values of it that are drawn uniformly from ranges."""
+class RewardRule:
+    """What is added to minus the landing error over the reach."""
 
-    base: Scene = field(default_factory=Scene)
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Range (low, high) of each randomised value; keys out of ``SCENE_VALUES``, units as theirs."""
+    success_radius: float = SUCCESS_RADIUS
+    """Errors up to this are a success [reaches]."""
+    success_bonus: float = 0.0
+    """Added for a success [-]."""
+    energy_cost: float = 0.0
+    """Taken off per joule that was stored for the hop [1/J]."""
 
     def __post_init__(self) -> None:
-        for name, bounds in self.ranges.items():
-            if name not in SCENE_VALUES:
-                raise InvalidParameterError(f"scene ranges: expected keys out of {SCENE_VALUES}, got {name!r}")
-            _check_range(name, bounds)
-            for bound in bounds:  # a bound that no scene can have is refused now, not at some later reset
-                self._with({name: bound})
-
-    @property
-    def observed(self) -> tuple[str, ...]:
-        """Names of the randomised values in the order in which they are observed."""
-        return tuple(name for name in SCENE_VALUES if name in self.ranges)
-
-    def bounds(self) -> tuple[Floats, Floats]:
-        """Least and greatest of the randomised values, in observed order, shapes (k,)."""
-        pairs = np.array([self.ranges[name] for name in self.observed], dtype=np.float64).reshape(-1, 2)
-        return pairs[:, 0], pairs[:, 1]
-
-    def corners(self) -> list[Scene]:
-        """The scenes whose randomised values are all at one end of their range; reaches are widest in one of them."""
-        ends = product(*(self.ranges[name] for name in self.observed))
-        return [self._with(dict(zip(self.observed, values, strict=True))) for values in ends]
-
-    def sample(self, rng: np.random.Generator) -> Scene:
-        """One scene."""
-        if not self.ranges:
-            return self.base
-        return self._with({name: rng.uniform(*self.ranges[name]) for name in self.observed})
-
-    def _with(self, values: Mapping[str, float]) -> Scene:
-        changes: dict[str, Any] = {name: float(value) for name, value in values.items()}
-        return replace(self.base, **changes)
+        for name in ("success_radius", "success_bonus", "energy_cost"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0 <= value < np.inf:
+                raise InvalidParameterError(f"{name}: expected a finite number >= 0, got {value!r}")
 
 
-def scene_ranges(scene: str | Scene | SceneRanges | Mapping[str, Any], landing: str | None = None) -> SceneRanges:
-    """What an env's ``scene=`` means: a preset's name, a Scene, or ranges such as ``{"gravity": (1.6, 9.8)}``.
+PLAIN_RULE = RewardRule()
 
-    In a mapping, ``"preset"`` names the base scene (default "earth"), a pair is a range and a number fixes a value.
-    ``landing`` ("rest" or "touchdown"), where given, replaces where the landing is read.
+
+def reward(
+    landing: ArrayLike,
+    target: ArrayLike,
+    status: ArrayLike,
+    reach: ArrayLike,
+    stored_energy: ArrayLike = 0.0,
+    rule: RewardRule = PLAIN_RULE,
+) -> Floats:
+    """Minus the landing error over the reach [m], with ``rule``'s bonus and cost of the ``stored_energy`` [J], shape (n,) [-].
+
+    Never below ``WORST_REWARD``, which failed hops get.
     """
-    if isinstance(scene, SceneRanges):
-        found = scene
-    elif isinstance(scene, Scene):
-        found = SceneRanges(scene)
-    elif isinstance(scene, str):
-        found = SceneRanges(Scene.preset(scene))
-    elif isinstance(scene, Mapping):
-        values = dict(scene)
-        ranges = {k: tuple(v) for k, v in values.items() if k != "preset" and isinstance(v, (tuple, list))}
-        fixed = {k: v for k, v in values.items() if k != "preset" and k not in ranges}
-        unknown = [k for k in fixed if k not in Scene.__dataclass_fields__]
-        if unknown:
-            raise InvalidParameterError(f"scene: expected keys out of {sorted(Scene.__dataclass_fields__)}, got {unknown}")
-        found = SceneRanges(Scene.preset(values.get("preset", "earth"), **fixed), ranges)  # type: ignore[arg-type]
+    error = landing_error(landing, target)
+    lost = failed(status) | ~np.isfinite(error)
+    score = -np.where(lost, 0.0, error) / np.asarray(reach) - rule.energy_cost * np.asarray(stored_energy)
+    if rule.success_bonus:
+        score = score + rule.success_bonus * success(landing, target, status, rule.success_radius * np.asarray(reach))
+    return np.where(lost, WORST_REWARD, np.maximum(score, WORST_REWARD))
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What an episode asks for: a target in a scene."""
+
+    scene: Scene
+    target: Floats
+    """As observed, in float32's digits: what is scored, shape (2,) [m]."""
+    observation: np.ndarray
+    """float32, shape (2 + k,)."""
+
+    def info(self) -> dict[str, Any]:
+        """What ``reset`` says: "target" (2,) [m], "reach" [m], "reachable"."""
+        known = bool(reachable(self.target, self.scene))
+        return {"target": self.target.copy(), "reach": reach(self.scene), "reachable": known}
+
+
+def draw_episode(
+    rng: np.random.Generator, scenes: SceneRanges, place: str | ArrayLike = "inside", options: Mapping[str, Any] | None = None
+) -> Episode:
+    """A scene and a target: drawn from ``rng``, or as ``options`` "scene" and "target" say.
+
+    ``place`` is where targets come from: one of ``TARGET_PLACES`` or a point (x, y) [m].
+    """
+    options = options or {}
+    unknown = sorted(set(options) - {"target", "scene"})
+    if unknown:
+        raise InvalidParameterError(f"reset options: expected keys out of ['scene', 'target'], got {unknown}")
+    scene = scenes.sample(rng)
+    if options.get("scene") is not None:
+        scene = _asked_scene(options["scene"], scene, scenes)
+    wanted = place if options.get("target") is None else options["target"]
+    target = sample_targets(rng, 1, scene, wanted)[0] if isinstance(wanted, str) else check_target(wanted, scene)
+    observation = observe(target, scene, scenes.observed)
+    return Episode(scene, observation[:2].astype(np.float64), observation)
+
+
+def _asked_scene(asked: Any, drawn: Scene, scenes: SceneRanges) -> Scene:
+    """The scene that reset was asked for, if it can be observed in this env."""
+    if isinstance(asked, Mapping):
+        scene = scenes.changed(drawn, asked)
+    elif isinstance(asked, str):
+        scene = replace(Scene.preset(asked), landing=drawn.landing)
+    elif isinstance(asked, Scene):
+        scene = asked
     else:
-        raise InvalidParameterError(f"scene: expected a preset's name, a Scene or a mapping of ranges, got {scene!r}")
-    return found if landing is None else SceneRanges(replace(found.base, landing=landing), found.ranges)
+        raise InvalidParameterError(f"reset options: scene: expected a preset's name, a Scene or a mapping, got {asked!r}")
+    for name in scenes.observed:
+        low, high = scenes.ranges[name]
+        if not low <= getattr(scene, name) <= high:
+            raise InvalidParameterError(f"reset options: scene: expected {name} in [{low}, {high}], got {getattr(scene, name)}")
+    limit, wanted = farthest_target(scenes), reach_of(scene).downhill + TARGET_LIMIT * reach(scene)
+    if wanted > limit * (1 + 1e-9):
+        raise InvalidParameterError(
+            f"reset options: scene: targets would lie up to {wanted:.3f} m away, expected at most this env's {limit:.3f} m; "
+            "make the env with this scene, or with ranges that hold it"
+        )
+    return scene
+
+
+def farthest_target(scenes: SceneRanges) -> float:
+    """Greatest distance at which a target may be asked for [m]."""
+    reaches = [reach_of(corner) for corner in scenes.corners()]
+    return max(r.downhill + TARGET_LIMIT * r.radius for r in reaches)
 
 
 def observation_bounds(scenes: SceneRanges) -> tuple[Floats, Floats]:
     """Least and greatest observation, shapes (2 + k,): target x, y [m], then what is randomised."""
     low, high = scenes.bounds()
-    reaches = [reach_of(corner) for corner in scenes.corners()]
-    far = max(r.downhill + TARGET_LIMIT * r.radius for r in reaches)
+    far = farthest_target(scenes)
     return np.concatenate([[-far, -far], low]), np.concatenate([[far, far], high])
 
 
@@ -217,19 +217,91 @@ def check_target(target: ArrayLike, scene: Scene) -> Floats:
     except (TypeError, ValueError):
         point = np.zeros(0)
     if point.shape != (2,) or not np.isfinite(point).all():
-        raise InvalidParameterError(f"target: expected two finite numbers (x, y) [m], got {target!r}")
+        raise InvalidParameterError(f"target: expected two finite numbers (x, y) [m] or {TARGET_PLACES}, got {target!r}")
     limit = TARGET_LIMIT * reach(scene)
     distance = float(np.hypot(*(point - reachable_middle(scene))))
     if distance > limit:
         raise InvalidParameterError(
-            f"target: expected within {limit:.3f} m ({TARGET_LIMIT:g} reaches) of the reachable disc's middle, "
+            f"target: expected within {limit:.3f} m ({TARGET_LIMIT:g} reaches) of the reachable region's middle, "
             f"got {tuple(point)} at {distance:.3f} m"
         )
     return point
 
 
-def _check_range(name: str, bounds: Any) -> None:
-    if len(bounds) != 2 or not all(isinstance(b, (int, float, np.number)) and np.isfinite(b) for b in bounds):
-        raise InvalidParameterError(f"scene ranges: {name}: expected (low, high), two finite numbers, got {bounds!r}")
-    if not bounds[0] < bounds[1]:
-        raise InvalidParameterError(f"scene ranges: {name}: expected low < high (a number fixes a value), got {bounds!r}")
+def check_action(action: Any, shape: tuple[int, ...]) -> Floats:
+    """Stretches as float64 within ``STRETCH_RANGE``; InvalidStretchesError where an action is no such thing.
+
+    float32 cannot hold 0.2 and 0.8 exactly, so bounds are checked as float32 and the overshoot is cut off.
+    """
+    low, high = STRETCH_RANGE
+    try:
+        stretches = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InvalidStretchesError(f"action: expected numbers in [{low}, {high}] of shape {shape}, got {action!r}") from None
+    if stretches.shape != shape:
+        raise InvalidStretchesError(f"action: expected shape {shape}, got {stretches.shape}")
+    single = stretches.astype(np.float32)
+    bad = ~((single >= np.float32(low)) & (single <= np.float32(high)))  # NaN fails this too
+    if bad.any():
+        worst = stretches[np.argmax(bad.any(axis=-1))] if stretches.ndim > 1 else stretches
+        raise InvalidStretchesError(
+            f"action: expected finite stretches in [{low}, {high}], got {worst}; clip actions, or rescale a policy's "
+            "[-1, 1] with gymnasium.wrappers.RescaleAction"
+        )
+    return np.clip(stretches, low, high)
+
+
+def check_fidelity(fidelity: str | Mapping[str, Any] | None) -> dict[str, Any]:
+    """Arguments of ``simulate`` that a fidelity means: a name out of ``FIDELITIES``, or a mapping of ``LEVERS``."""
+    if isinstance(fidelity, Mapping) and set(fidelity) <= set(LEVERS):
+        return dict(fidelity)
+    if isinstance(fidelity, str) and fidelity in FIDELITIES:
+        return dict(FIDELITIES[fidelity])
+    raise InvalidParameterError(f"fidelity: expected one of {sorted(FIDELITIES)} or a mapping of {LEVERS}, got {fidelity!r}")
+
+
+def simulate_hops(
+    stretches: Floats, scenes: Sequence[Scene], lattice: Lattice, **levers: Any
+) -> tuple[list[HopResult], np.ndarray]:
+    """Simulate hops, one batch for each scene that occurs; stretches of shape (n, 4), n scenes.
+
+    Returns the batches and, for each hop, its batch and its row in there, shape (n, 2).
+    """
+    distinct = list(dict.fromkeys(scenes))
+    where = np.array([distinct.index(scene) for scene in scenes])
+    rows = np.zeros(len(scenes), dtype=np.int64)
+    for k in range(len(distinct)):
+        rows[where == k] = np.arange((where == k).sum())
+    if len(distinct) == 1:
+        return [simulate(stretches, scene=distinct[0], lattice=lattice, **levers)], np.column_stack([where, rows])
+
+    def one(k: int) -> HopResult:
+        return simulate(stretches[where == k], scene=distinct[k], lattice=lattice, threads=1, **levers)
+
+    with ThreadPoolExecutor(thread_count(None)) as pool:
+        return list(pool.map(one, range(len(distinct)))), np.column_stack([where, rows])
+
+
+def play(
+    stretches: Floats, episodes: Sequence[Episode], lattice: Lattice, rule: RewardRule = PLAIN_RULE, **levers: Any
+) -> list[tuple[float, dict[str, Any], HopResult, int]]:
+    """Hops of n running episodes, stretches of shape (n, 4): of each, reward, info, its batch and its row in there."""
+    batches, where = simulate_hops(stretches, [episode.scene for episode in episodes], lattice, **levers)
+    outcomes = []
+    for episode, (batch, row) in zip(episodes, where, strict=True):
+        hop, one = batches[batch], slice(row, row + 1)
+        scored = (hop.landing[one], episode.target[None], hop.status[one])
+        unit = reach(episode.scene)
+        info = {
+            "landing": hop.landing[row].copy(),
+            "touchdown": hop.touchdown[row].copy(),
+            "error": float(landing_error(*scored[:2])[0]),
+            "success": bool(success(*scored, rule.success_radius * unit)[0]),
+            "apex": float(hop.apex[row]),
+            "energies": hop.energies[row].copy(),
+            "stored_energy": float(hop.stored_energy[row]),
+            "status": HopStatus(int(hop.status[row])),
+            "simulator_calls": 1,
+        }
+        outcomes.append((float(reward(*scored, unit, hop.stored_energy[one], rule)[0]), info, hop, int(row)))
+    return outcomes

@@ -2,35 +2,52 @@
 
 from __future__ import annotations
 
+import json
+import sys
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from scipy.stats import qmc
 
 import tensegrity_gym  # noqa: F401 (registers the env)
-from tensegrity_gym import ENERGY_NAMES, HopStatus, Scene, simulate, task
-from tensegrity_gym import env as env_module
-from tensegrity_gym.env import TensegrityHopEnv, check_action, register_envs
-from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError, ResetNeededError, UnknownPresetError
+from tensegrity_gym import ENERGY_NAMES, MODEL_VERSION, HopStatus, Scene, reachable, simulate, task, viewer
+from tensegrity_gym import task as task_module
+from tensegrity_gym.env import TensegrityHopEnv, register_envs
+from tensegrity_gym.errors import (
+    InvalidParameterError,
+    InvalidStretchesError,
+    MissingExtraError,
+    ResetNeededError,
+    UnknownPresetError,
+)
+from tensegrity_gym.reachable import LANDINGS, measure_reach, reach_of, save_reach, stored_reach
+from tensegrity_gym.scene_ranges import SCENE_VALUES
+from tensegrity_gym.video import RecordVideo
 
 MIDDLE = np.full(4, 0.5, dtype=np.float32)
 #: Hops that are over soon, for tests in which the physics plays no part.
 SHORT = Scene(duration=0.3)
+#: What measure_reach simulates with eight hops.
+STRETCHES_OF_8 = 0.2 + 0.6 * qmc.Sobol(d=4, seed=0).random_base2(3)
 RANGES = {"gravity": (6.0, 9.8), "friction": (0.4, 0.6), "slope": (0.0, 0.1), "duration": 0.3}
 
 
+@pytest.mark.parametrize("mode", [None, "rgb_array", "rgb_array_list"])
 @pytest.mark.parametrize("scene", [SHORT, RANGES], ids=["one scene", "ranges"])
-def test_gymnasium_check_env(scene: Any) -> None:
+def test_gymnasium_check_env(scene: Any, mode: str | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # the one warning we cannot avoid: actions are stretches, not in [-1, 1], see docs
         warnings.filterwarnings("ignore", message=".*symmetric and normalized.*")
         # check_env wants an env that gym.make has made, without wrappers
-        check_env(gym.make("TensegrityHop-v0", scene=scene, render_mode="rgb_array").unwrapped)
+        check_env(gym.make("TensegrityHop-v0", scene=scene, render_mode=mode).unwrapped, skip_render_check=True)
 
 
 def test_sb3_check_env() -> None:
@@ -84,7 +101,7 @@ def test_where_the_landing_is_read_is_an_option() -> None:
     for landing, expected in (("rest", hop.rest), ("touchdown", hop.touchdown)):
         env = TensegrityHopEnv(landing=landing)
         _, info = env.reset(seed=0)
-        assert info["reach"] == task.REACHES["earth"][landing].radius
+        assert info["reach"] == stored_reach("earth", landing).radius
         np.testing.assert_allclose(env.step(MIDDLE)[4]["landing"], expected[0], atol=1e-12)
 
 
@@ -120,7 +137,7 @@ def test_a_randomised_scene_is_observed_and_simulated() -> None:
     env = TensegrityHopEnv(scene=RANGES)
     assert env.observation_space.shape == (5,)
     observation, _ = env.reset(seed=0)
-    for value, name in zip(observation[2:], task.SCENE_VALUES, strict=True):
+    for value, name in zip(observation[2:], SCENE_VALUES, strict=True):
         low, high = RANGES[name]  # type: ignore[misc]
         assert low <= value <= high
     scene = env.scene
@@ -135,7 +152,7 @@ def test_a_randomised_scene_is_observed_and_simulated() -> None:
 def test_a_failed_hop_gets_the_worst_reward(monkeypatch: pytest.MonkeyPatch) -> None:
     real = simulate(MIDDLE.astype(float), scene=SHORT)
     broken = replace(real, status=np.array([int(HopStatus.UNSTABLE)]))
-    monkeypatch.setattr(env_module, "simulate", lambda *_, **__: broken)
+    monkeypatch.setattr(task_module, "simulate", lambda *_, **__: broken)
     env = TensegrityHopEnv(scene=SHORT)
     env.reset(seed=0, options={"target": real.landing[0]})
     _, reward, terminated, _, info = env.step(MIDDLE)
@@ -149,15 +166,40 @@ def test_rewards_are_finite_and_never_below_the_worst() -> None:
     np.testing.assert_allclose(found, [0, -1, task.WORST_REWARD, task.WORST_REWARD, task.WORST_REWARD], rtol=1e-15)
 
 
-def test_targets_fill_the_reachable_disc_evenly() -> None:
-    scene = Scene.preset("slope", slope_direction=0.5)
-    targets = task.sample_targets(np.random.default_rng(0), 4000, scene) - task.reachable_middle(scene)
-    radius = np.linalg.norm(targets, axis=1) / task.reach(scene)
-    assert radius.max() <= 1
-    # uniform in area: P(r < x) = x^2; the Kolmogorov-Smirnov statistic is below 1.95/sqrt(n) but once in a thousand
-    distance = np.abs(np.sort(radius) ** 2 - (np.arange(4000) + 0.5) / 4000).max()
-    assert distance < 1.95 / np.sqrt(4000)
-    assert np.linalg.norm(targets.mean(axis=0)) < 4 * task.reach(scene) / 2 / np.sqrt(4000)
+@pytest.mark.parametrize("landing", ["rest", "touchdown"])
+def test_targets_fill_the_reachable_region_evenly(landing: str) -> None:
+    scene = Scene.preset("slope", slope_direction=0.5, landing=landing)
+    targets = task.sample_targets(np.random.default_rng(0), 4000, scene)
+    away = targets - task.reachable_middle(scene)
+    angle = np.arctan2(away[:, 1], away[:, 0]) - 0.5
+    share = np.linalg.norm(away, axis=1) / reach_of(scene).distance(angle)
+    assert share.max() <= 1 + 1e-9
+    assert task.reachable(targets * (1 - 1e-9) + 1e-9 * task.reachable_middle(scene), scene).all()
+    # uniform in area: P(share < x) = x^2; the Kolmogorov-Smirnov statistic is below 1.95/sqrt(n) but once in a thousand
+    assert np.abs(np.sort(share) ** 2 - (np.arange(4000) + 0.5) / 4000).max() < 1.95 / np.sqrt(4000)
+    # and the half of the directions that is downhill holds its share of the area
+    fine = np.linspace(-np.pi, np.pi, 2001)[:-1] + np.pi / 2000
+    area = reach_of(scene).distance(fine) ** 2
+    expected = area[np.abs(fine) < np.pi / 2].sum() / area.sum()
+    downhill = (np.cos(angle) > 0).mean()
+    assert abs(downhill - expected) < 4 * np.sqrt(expected * (1 - expected) / 4000)
+
+
+def test_targets_come_from_the_boundary_or_beyond_on_request() -> None:
+    scene = Scene()
+    rng = np.random.default_rng(0)
+    edge = task.sample_targets(rng, 200, scene, "boundary")
+    angle = np.arctan2(edge[:, 1], edge[:, 0])
+    np.testing.assert_allclose(np.linalg.norm(edge, axis=1), reach_of(scene).distance(angle), rtol=1e-12)
+    far = task.sample_targets(rng, 200, scene, "beyond")
+    assert not task.reachable(far, scene).any()
+    assert np.linalg.norm(far, axis=1).max() <= task.TARGET_LIMIT * task.reach(scene)
+    for place, known in (("inside", True), ("beyond", False)):
+        env = TensegrityHopEnv(target=place)
+        assert env.reset(seed=0)[1]["reachable"] is known
+        assert env.reset(options={"target": "inside"})[1]["reachable"] is True
+    fixed = TensegrityHopEnv(target=(0.3, -0.2))
+    assert {tuple(fixed.reset(seed=k)[0]) for k in range(3)} == {(np.float32(0.3), np.float32(-0.2))}
 
 
 @pytest.mark.parametrize("scene", ["earth", "slope", {"gravity": (1.3, 9.8)}, {"slope": (0.0, 0.2)}], ids=str)
@@ -166,17 +208,163 @@ def test_targets_lie_within_the_observation_space(scene: Any) -> None:
     assert all(env.observation_space.contains(env.reset(seed=seed)[0]) for seed in range(200))
 
 
+def test_bonus_and_cost_are_options() -> None:
+    env = TensegrityHopEnv(scene=SHORT, success_bonus=2.0, energy_cost=0.01, success_radius=0.5)
+    env.reset(options={"target": (0.0, 0.0)})
+    _, reward, _, _, info = env.step(MIDDLE)
+    assert info["success"]
+    assert info["stored_energy"] > 1
+    expected = -info["error"] / task.reach(SHORT) + 2.0 - 0.01 * info["stored_energy"]
+    assert reward == pytest.approx(expected, rel=1e-12)
+    miserly = TensegrityHopEnv(scene=SHORT, energy_cost=1e3)
+    miserly.reset(seed=0)
+    assert miserly.step(MIDDLE)[1] == task.WORST_REWARD
+
+
+def test_a_scene_can_be_asked_for_at_reset() -> None:
+    env = TensegrityHopEnv(scene={**RANGES, "slope": 0.0})
+    env.reset(seed=0, options={"scene": {"gravity": 7.0}})
+    assert env.scene is not None
+    assert env.scene.gravity == 7.0
+    assert env.scene.duration == RANGES["duration"]
+    assert 0.4 <= env.scene.friction <= 0.6  # drawn as ever
+    env.reset(options={"scene": replace(SHORT, gravity=8.0)})
+    assert env.scene == replace(SHORT, gravity=8.0)
+    with pytest.raises(InvalidParameterError, match=r"expected gravity in \[6.0, 9.8\], got 3.7208"):
+        env.reset(options={"scene": "mars"})
+    moon = TensegrityHopEnv(scene="moon", landing="touchdown")
+    moon.reset(options={"scene": "earth"})  # known, if unobserved: whoever asks for it knows it
+    assert moon.scene == Scene(landing="touchdown")
+
+
+def test_fidelity_is_what_simulate_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+    real = simulate(MIDDLE.astype(float), scene=SHORT)
+
+    def noted(*_: Any, **arguments: Any) -> Any:
+        asked.append(arguments)
+        return real
+
+    monkeypatch.setattr(task_module, "simulate", noted)
+    levers = ({}, {"precision": "float32"}, {"dt": 1e-6, "integrator": "velocity_verlet"})
+    for fidelity, expected in zip(("paper", "single", levers[2]), levers, strict=True):
+        env = TensegrityHopEnv(scene=SHORT, fidelity=fidelity)
+        env.reset(seed=0)
+        env.step(MIDDLE)
+        assert {k: v for k, v in asked[-1].items() if k in task.LEVERS} == expected
+
+
+@pytest.mark.parametrize("preset", Scene.PRESETS)
+def test_stored_reaches_say_what_they_were_made_by(preset: str) -> None:
+    stored = json.loads((reachable.FOLDER / f"{preset}.json").read_text())
+    again = f"python -m tensegrity_gym reach --scene {preset} --save"
+    assert stored["model_version"] == MODEL_VERSION, f"made with another model; run {again}"
+    assert stored["scene"] == asdict(Scene.preset(preset)), f"made in another scene; run {again}"
+    assert stored["command"].startswith(f"python -m tensegrity_gym reach --scene {preset} ")
+    for landing in LANDINGS:
+        region = stored_reach(preset, landing)
+        assert len(region.boundary) == reachable.DIRECTIONS
+        assert 0 < min(region.boundary) <= region.radius <= max(region.boundary) < task.TARGET_LIMIT * region.radius
+
+
+def test_reach_is_measured_and_saved(tmp_path: Path) -> None:
+    scene = Scene(duration=1.2)
+    measured = measure_reach(scene, hops=8)
+    landings = simulate(STRETCHES_OF_8, scene=scene).touchdown
+    assert measured["touchdown"].radius <= np.linalg.norm(landings, axis=1).max()
+    assert measured["touchdown"].radius >= np.median(np.linalg.norm(landings, axis=1))
+    symmetric = np.array(measured["touchdown"].boundary)
+    np.testing.assert_allclose(symmetric, np.roll(symmetric[::-1], 1), rtol=1e-9)  # y to -y
+    saved = json.loads(save_reach("earth", measured, 8, 0, tmp_path).read_text())
+    assert saved["rest"]["radius"] == round(measured["rest"].radius, 5)
+
+
+def test_reaches_grow_as_gravity_shrinks() -> None:
+    for landing in LANDINGS:
+        for slope in (0.0, 0.1):
+            gravities = np.linspace(1.0, 12.0, 45)
+            found = [task.reach(Scene(gravity=g, slope=slope, landing=landing)) for g in gravities]
+            assert (np.diff(found) <= 0).all()
+        assert reach_of(Scene(gravity=3.7208, landing=landing)) == stored_reach("mars", landing)
+
+
 def test_pictures_before_and_after_the_hop() -> None:
     env = TensegrityHopEnv(scene=SHORT, render_mode="rgb_array")
     env.reset(seed=0)
     before = env.render()
     env.step(MIDDLE)
     after = env.render()
-    assert before is not None
-    assert after is not None
+    assert isinstance(before, np.ndarray)
+    assert isinstance(after, np.ndarray)
     assert before.shape == after.shape
     assert before.dtype == after.dtype == np.uint8
     assert (before != after).any()
+
+
+def test_all_frames_of_the_hop_are_a_list() -> None:
+    env = TensegrityHopEnv(scene=SHORT, render_mode="rgb_array_list")
+    env.reset(seed=0)
+    env.step(MIDDLE)
+    frames = env.render()
+    assert isinstance(frames, list)
+    # the standing lattice, the release, and 30 frames a second
+    assert abs(len(frames) - (2 + SHORT.duration * env.metadata["render_fps"])) <= 1
+    assert {frame.shape for frame in frames} == {(480, 640, 3)}
+    assert all((a != b).any() for a, b in pairwise(frames))
+    assert env.render() == []  # gymnasium's convention: each frame is given once
+    env.reset()
+    assert len(env.render() or []) == 1
+
+
+def test_a_video_has_the_whole_hop(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy")
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    env = RecordVideo(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array_list"), str(tmp_path))
+    env.reset(seed=0)
+    env.step(MIDDLE)
+    env.close()
+    (film,) = tmp_path.glob("*.mp4")
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
+    assert abs(frames - (2 + SHORT.duration * 30)) <= 1
+    assert seconds == pytest.approx(frames / 30, abs=0.02)
+    env = RecordVideo(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array"), str(tmp_path / "two"))
+    env.reset(seed=0)
+    env.step(MIDDLE)
+    assert len(env.recorded_frames) == 2  # a picture and a filmstrip
+    env.close()
+
+
+def test_a_person_sees_all_frames_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[int] = []
+
+    class Fake:
+        def __init__(self, width: int, height: int) -> None:
+            assert (width, height) == (640, 480)
+
+        def play(self, pictures: list[np.ndarray], fps: float) -> None:
+            assert fps == 30
+            shown.append(len(pictures))
+
+        def close(self) -> None:
+            shown.append(-1)
+
+    monkeypatch.setattr(viewer, "Window", Fake)
+    env = gym.make("TensegrityHop-v0", scene=SHORT, render_mode="human")
+    env.reset(seed=0)
+    env.step(MIDDLE)
+    assert env.render() is None
+    env.close()
+    assert shown[0] == 1
+    assert abs(shown[1] - (1 + SHORT.duration * 30)) <= 1
+    assert shown[2] == -1
+
+
+def test_a_window_without_a_display_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    if sys.platform != "linux":
+        pytest.skip("other systems always have a display")
+    with pytest.raises(MissingExtraError, match=r"render_mode 'human' needs .*use.*rgb_array_list"):
+        TensegrityHopEnv(scene=SHORT, render_mode="human").reset(seed=0)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +392,7 @@ def test_actions_that_are_no_stretches_are_refused(action: Any) -> None:
 def test_the_bounds_themselves_are_actions_in_either_precision() -> None:
     for dtype in (np.float32, np.float64):
         for bound in (0.2, 0.8):
-            checked = check_action(np.full(4, bound, dtype=dtype), (4,))
+            checked = task.check_action(np.full(4, bound, dtype=dtype), (4,))
             assert checked.dtype == np.float64
             np.testing.assert_allclose(checked, bound, rtol=2e-8)  # half a unit in the last place of float32
             simulate(checked, scene=Scene(duration=0.01))  # and the simulator takes them
@@ -223,10 +411,14 @@ def test_step_needs_a_running_episode() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"goal": (0, 0)}, r"reset options: expected keys out of \['target'\], got \['goal'\]"),
+        ({"goal": (0, 0)}, r"reset options: expected keys out of \['scene', 'target'\], got \['goal'\]"),
+        ({"scene": 3}, "scene: expected a preset's name, a Scene or a mapping, got 3"),
+        ({"scene": {"air": 1.0}}, "scene: expected keys out of"),
+        ({"scene": "moon"}, "targets would lie up to .* make the env with this scene"),
+        ({"target": "here"}, "target: expected one of"),
+        ({"target": None, "scene": None, "more": 1}, "expected keys out of"),
         ({"target": (0.1,)}, "target: expected two finite numbers"),
         ({"target": (0.1, np.nan)}, "target: expected two finite numbers"),
-        ({"target": "here"}, "target: expected two finite numbers"),
         ({"target": (100.0, 0.0)}, r"target: expected within .* reaches.*got"),
     ],
 )
@@ -248,6 +440,12 @@ def test_options_that_mean_nothing_are_refused(options: dict[str, Any], said: st
         ({"scene": {"friction": (-1.0, 0.5)}}, InvalidParameterError, r"Scene\.friction: expected"),
         ({"landing": "orbit"}, InvalidParameterError, r"Scene\.landing: expected one of"),
         ({"success_radius": -1.0}, InvalidParameterError, "success_radius: expected"),
+        ({"success_bonus": np.nan}, InvalidParameterError, "success_bonus: expected a finite number"),
+        ({"energy_cost": "much"}, InvalidParameterError, "energy_cost: expected a finite number"),
+        ({"target": "everywhere"}, InvalidParameterError, "target: expected one of"),
+        ({"target": (9.0, 9.0)}, InvalidParameterError, r"target: expected within .* reaches"),
+        ({"fidelity": "perfect"}, InvalidParameterError, "fidelity: expected one of"),
+        ({"fidelity": {"gravity": 1}}, InvalidParameterError, "fidelity: expected one of"),
         ({"render_mode": "hologram"}, InvalidParameterError, "render_mode: expected"),
     ],
 )

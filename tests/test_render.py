@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from tensegrity_gym import Design, Lattice, Scene, simulate
-from tensegrity_gym.canvas import FULL_BOW, LIGHT, Camera, bar_bow, bar_curves
+from tensegrity_gym import Design, Lattice, Scene, form_find, simulate
+from tensegrity_gym.canvas import BAR_COLOURS, CABLE_COLOURS, LIGHT, SLACK, Camera, Canvas, bar_curves, member_loads
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.render import choose_moments, draw_posture, filmstrip, record_hop, watching_camera
+from tensegrity_gym.render import choose_moments, draw_posture, filmstrip, hop_frames, record_hop, watching_camera, whole_hop
 from tensegrity_gym.simulate import HopResult
 
 LATTICE, DESIGN = Lattice(2, 2), Design()
@@ -67,15 +69,48 @@ def test_bars_are_drawn_through_their_masses(standing: np.ndarray) -> None:
     np.testing.assert_allclose(curves[:, ::4], bent[STRUCTURE.bars], atol=1e-14)
 
 
-def test_bow_is_the_distance_from_the_chord_over_the_length(standing: np.ndarray) -> None:
-    assert bar_bow(standing, STRUCTURE).max() < 1e-12
-    bent = standing.copy()
-    first = STRUCTURE.bars[0]
-    chord = bent[first[-1]] - bent[first[0]]
-    aside = np.cross(chord, (0.3, 0.2, 0.9))
-    bent[first[1:3]] += 0.05 * aside / np.linalg.norm(aside)
-    assert bar_bow(bent, STRUCTURE)[0] == pytest.approx(0.05 / DESIGN.bar_length, rel=1e-4)
-    assert bar_bow(bent, STRUCTURE)[0] < FULL_BOW
+def test_loads_are_those_of_form_finding_over_the_critical_load() -> None:
+    found = form_find([0.3, 0.4, 0.3, 0.4])
+    held = found.stretches[0] * DESIGN.cell_height
+    bars, cables, actuators = member_loads(found.positions[0], STRUCTURE, held)
+    np.testing.assert_allclose(bars, found.bar_load[0] / DESIGN.critical_load, rtol=1e-4)
+    np.testing.assert_allclose(cables, found.cable_tension[0] / DESIGN.critical_load, rtol=1e-4)
+    np.testing.assert_allclose(actuators, found.actuator_tension[0] / DESIGN.critical_load, rtol=1e-4)
+
+
+def test_bars_are_coloured_by_load_and_cables_by_tension(standing: np.ndarray) -> None:
+    colours = np.array(BAR_COLOURS, dtype=float)
+    for shrink, expected in ((1.0, None), (0.99, colours[-1]), (1.01, colours[0])):
+        points = np.concatenate([standing[: LATTICE.n_nodes] * shrink, standing[LATTICE.n_nodes :]])
+        inner = STRUCTURE.bars
+        for k in (1, 2):
+            points[inner[:, k]] = points[inner[:, 0]] + k / 3 * (points[inner[:, 3]] - points[inner[:, 0]])
+        load = member_loads(points, STRUCTURE, STRUCTURE.actuator_length)[0]
+        if expected is None:  # the unloaded lattice: prestress, below the critical load
+            np.testing.assert_allclose(load, DESIGN.prestress_load / DESIGN.critical_load, rtol=0.02)
+        else:  # a 1 % shorter bar is far beyond its critical load, a longer one in tension
+            assert (load > 1).all() if shrink < 1 else (load < 0).all()
+    seen = {tuple(c) for c in _stroke_colours(standing * 0.9)}
+    assert tuple(SLACK) in seen  # all cables are slack in a lattice shrunk by a tenth
+    assert tuple(SLACK) not in {tuple(c) for c in _stroke_colours(standing * 1.01)}
+    assert any(c == CABLE_COLOURS[-1] for c in {tuple(c) for c in _stroke_colours(standing * 1.1)})
+
+
+def _stroke_colours(points: np.ndarray) -> np.ndarray:
+    """Colours that a lattice is drawn with, without the paleness of what is far."""
+    kept: list[np.ndarray] = []
+
+    class Flat(Camera):
+        def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+            pixels, near = super().project(points, size)
+            return pixels, np.zeros_like(near)
+
+    class Noted(Canvas):
+        def strokes(self, ends: object, metres: object, colour: object) -> None:
+            kept.append(np.asarray(colour))
+
+    Noted((200, 150), Flat()).lattice(points, STRUCTURE)
+    return np.round(kept[-1]).astype(int)
 
 
 def test_filmstrip_of_a_hop(hop: HopResult) -> None:
@@ -115,11 +150,27 @@ def test_the_watching_camera_has_the_whole_hop_in_view(hop: HopResult) -> None:
     assert (pixels < np.array(size)).all()
 
 
+def test_frames_begin_at_release_and_follow_the_centre_of_mass(hop: HopResult) -> None:
+    film = whole_hop(hop)
+    assert film.times[0, 0] == 0
+    np.testing.assert_array_equal(film.positions[0, 0], hop.equilibria.positions[0])
+    np.testing.assert_array_equal(film.energies[0, 0], hop.energies[0, 0])
+    few = replace(film, frames=np.array([20]))
+    pictures = hop_frames(few, size=(160, 120), target=(3.0, 1.0))
+    assert len(pictures) == 20
+    assert all((a != b).any() for a, b in pairwise(pictures))
+    camera = watching_camera(film.positions[0, :20], (160, 120), (3.0, 1.0))
+    seen, _ = camera.project(np.array([[3.0, 1.0, 0.0]]), (160, 120))
+    assert ((seen > 0) & (seen < (160, 120))).all()  # the target too is in view
+    with pytest.raises(InvalidParameterError, match="give simulate a trajectory_rate"):
+        whole_hop(replace(hop, trajectory=None))
+
+
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_a_film_has_all_frames(suffix: str, tmp_path: Path) -> None:
     scene = Scene(duration=0.5)
     path = record_hop([0.4, 0.4, 0.4, 0.4], tmp_path / f"hop{suffix}", scene=scene, fps=10, speed=0.5, size=(120, 120))
-    expected = 0.5 * 10 / 0.5 + 1
+    expected = 0.5 * 10 / 0.5 + 1  # with the posture at release
     if suffix == ".gif":
         with Image.open(path) as film:
             assert abs(film.n_frames - expected) <= 1
