@@ -122,9 +122,10 @@ def test_a_lattice_is_stable_below_the_critical_step_and_not_above(size: tuple[i
 def test_the_default_step_is_the_critical_one_with_a_margin() -> None:
     design, lattice = Design(), Lattice(2, 2)
     critical = critical_time_step(design.structure(lattice), design.unloaded_positions(lattice))
-    assert default_time_step(design, lattice) == pytest.approx(MARGIN * critical, rel=1e-5)
+    assert 0.99 * MARGIN * critical < default_time_step(design, lattice) <= MARGIN * critical * (1 + 1e-5)  # cut to three digits
     assert 0.5 < MARGIN < 1.0
     # stiffer bars and cables, smaller steps: dt ~ 1 / sqrt(E)
     soft = Design(bar_damping=0.0, cable_damping=0.0)
     stiff = replace(soft, bar_modulus=4 * soft.bar_modulus, cable_modulus=4 * soft.cable_modulus)
-    assert default_time_step(stiff, lattice) == pytest.approx(0.5 * default_time_step(soft, lattice), rel=1e-4)
+    steps = [critical_time_step(d.structure(lattice), d.unloaded_positions(lattice)) for d in (stiff, soft)]
+    assert steps[0] == pytest.approx(0.5 * steps[1], rel=1e-5)
