@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
-from scipy.interpolate import CubicSpline
 
 from tensegrity_gym import raster
 from tensegrity_gym.energies import member_forces
@@ -173,6 +172,8 @@ def _spline(masses: int, samples: int) -> Floats:
     if masses == 2:
         return np.eye(2)
     at = np.linspace(0, masses - 1, samples * (masses - 1) + 1)
+    from scipy.interpolate import CubicSpline  # heavy to import
+
     return np.asarray(CubicSpline(np.arange(masses), np.eye(masses), bc_type="natural")(at))
 
 

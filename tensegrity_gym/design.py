@@ -12,7 +12,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from tensegrity_gym.core.forces import MAX_SEGMENTS
 from tensegrity_gym.errors import InvalidParameterError
@@ -59,6 +58,7 @@ def _edge_lengths(node: Floats) -> tuple[float, float, float]:
 @lru_cache(maxsize=1)
 def equal_cable_equilibrium() -> CellEquilibrium:
     """The self-equilibrium whose 36 cables have equal lengths: q_s/q_e = 0.91982, twist 14.146 degrees."""
+    from scipy.optimize import brentq  # takes longer to import than the rest of this package
 
     def length_difference(square_density: float) -> float:
         square, between, _ = _edge_lengths(cell_equilibrium(square_density).node)

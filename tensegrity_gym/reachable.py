@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
 from tensegrity_gym.batch import Progress
 from tensegrity_gym.errors import InvalidParameterError
@@ -110,6 +109,8 @@ def measure_reach(scene: Scene, hops: int = 256, seed: int = 0, progress: Progre
     The lattice's symmetries map hops onto hops (on a slope, those that keep its direction), so each counts with its images.
     """
     low, high = STRETCH_RANGE
+    from scipy.stats import qmc  # heavy to import, and only this command needs it
+
     sobol = qmc.Sobol(d=4, seed=seed).random_base2(int(np.ceil(np.log2(hops))))[:hops]
     result = simulate(low + (high - low) * sobol, scene=scene, progress=progress)
     return {landing: _region_of(_landings(result, landing), scene) for landing in LANDINGS}

@@ -144,10 +144,14 @@ def simulate(
     # whatever the bars give back, kinetic energy stays below it plus the fall; ten times that is no physics
     weight = structure.mass.sum() * scene.gravity
     runaway = 10.0 * (equilibria.stored_energy + weight * (design.cell_height + scene.gravity * scene.duration**2))
+    finite = np.isfinite(equilibria.positions).all(axis=(1, 2)) & np.isfinite(runaway)
+    usable = equilibria.converged & finite
+    # a hop without a start is not simulated, but what is reported of it must be finite
+    starts = np.where(finite[:, None, None], equilibria.positions, design.unloaded_positions(lattice))
     parts = []
     for first in range(0, len(equilibria.stretches), CHUNK):
         chunk = slice(first, first + CHUNK)
-        records = _records(equilibria.positions[chunk], equilibria.converged[chunk], runaway[chunk], settings)
+        records = _records(starts[chunk], usable[chunk], runaway[chunk], settings)
         _roll_out(INTEGRATORS[integrator][0], structure, scene, settings, records, threads, progress, np.dtype(precision))
         parts.append(_measure(records, structure, scene, lattice, settings.lag * settings.dt))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -200,7 +204,7 @@ def _settings(structure: Structure, scene: Scene, design: Design, dt: float, lag
     )
 
 
-def _records(positions: Floats, converged: np.ndarray, runaway_energy: Floats, settings: kernel.HopSettings) -> kernel.HopRecords:
+def _records(positions: Floats, usable: np.ndarray, runaway_energy: Floats, settings: kernel.HopSettings) -> kernel.HopRecords:
     n, m = positions.shape[:2]
     frames = settings.max_steps // settings.frame_stride if settings.frame_stride else 0
     state = np.zeros((n, 4, 2, m, 3))
@@ -213,7 +217,7 @@ def _records(positions: Floats, converged: np.ndarray, runaway_energy: Floats, s
         height=np.zeros(n),
         steps=np.zeros(n, dtype=np.int64),
         runaway_energy=runaway_energy,
-        status=np.where(converged, -1, int(HopStatus.NOT_CONVERGED)),
+        status=np.where(usable, -1, int(HopStatus.NOT_CONVERGED)),
         failed_mass=np.full(n, -1, dtype=np.int64),
         frame_positions=np.zeros((n, frames, m, 3)),
         frame_times=np.zeros((n, frames)),

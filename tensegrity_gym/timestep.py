@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.sparse import csr_matrix
-from scipy.sparse.linalg import eigsh
 
 from tensegrity_gym.design import Design
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.types import Floats, Structure
+
+if TYPE_CHECKING:  # SciPy takes longer to import than the rest of this package: functions import it when called
+    from scipy.sparse import csr_matrix
 
 #: Default step over the critical one.
 MARGIN = 0.8
@@ -23,6 +24,8 @@ def spring_matrix(structure: Structure, positions: Floats, weights: tuple[Floats
 
     ``weights`` are the stiffnesses [N/m] or dampings [N s/m] of the three classes; all members count as taut.
     """
+    from scipy.sparse import csr_matrix
+
     n = len(structure.mass)
     segments = np.stack([structure.bars[:, :-1], structure.bars[:, 1:]], axis=-1)
     pairs = np.concatenate([structure.cables, structure.actuators, segments.reshape(-1, 2)])
@@ -43,6 +46,9 @@ def critical_time_step(structure: Structure, positions: Floats) -> float:
     The condition is that dt^2/4 K + dt/2 C has no eigenvalue (over the masses) above one; for a single mode it reads
     dt < 2/omega (sqrt(1 + zeta^2) - zeta). Bars' axial modes set it; bending and geometric stiffness are 1e-3 of theirs.
     """
+    from scipy.optimize import brentq
+    from scipy.sparse.linalg import eigsh
+
     actuator_stiffness = structure.actuator_rigidity / structure.actuator_length
     stiffness = spring_matrix(structure, positions, (structure.cable_stiffness, actuator_stiffness, structure.segment_stiffness))
     dampings = (structure.cable_damping, structure.actuator_damping * actuator_stiffness, structure.segment_damping)

@@ -1,6 +1,8 @@
 """Velocity Verlet: positions and velocities at whole steps. Second order, one force a step.
 
-The damping force takes the velocity of the half step, which keeps it explicit; a contact impulse follows each half kick.
+The damping force takes the velocity of the half step, which keeps it explicit. Collisions come before the first half kick, and
+resting contacts (e = 0) after each of the two. The second must not touch a mass that has only just come down: it would stop it
+before its collision, and nothing would bounce.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ def velocity_verlet_step(forces, structure, actuator_length, ground, dt, kick, x
 
     ``kick`` and ``work`` are not used. Returns as described in the package.
     """
-    first = _half_kick(structure, ground, splat(0.5 * dt, kick), ground.restitution, x, v, f)
+    half = splat(0.5 * dt, kick)
+    first = _half_kick(structure, ground, half, True, x, v, f)
     lowest = load(x, 0, 2) + 1e30
     for i in range(structure.mass.shape[0]):
         for c in range(3):
@@ -24,12 +27,12 @@ def velocity_verlet_step(forces, structure, actuator_length, ground, dt, kick, x
         z = load(x, i, 2)
         lowest = select(z < lowest, z, lowest)
     power = forces(structure, actuator_length, ground.gravity, x, v, f, memory)
-    return power, first + _half_kick(structure, ground, splat(0.5 * dt, kick), 0.0, x, v, f), lowest
+    return power, first + _half_kick(structure, ground, half, False, x, v, f), lowest
 
 
 @jit
-def _half_kick(structure, ground, half, restitution, x, v, f):
-    """v += half f / m with the ground's impulses; returns the energy that these dissipate [J]."""
+def _half_kick(structure, ground, half, collide, x, v, f):
+    """v += half f / m, between collisions (if ``collide``) and resting contacts; returns the energy these dissipate [J]."""
     dissipated = half * 0.0
     for i in range(structure.mass.shape[0]):
         inverse = half * structure.inverse_mass[i]
@@ -38,8 +41,12 @@ def _half_kick(structure, ground, half, restitution, x, v, f):
         touching = load(x, i, 2) <= 0.0
         nx, ny, nz = vx + ax, vy + ay, vz + az
         if any_lane(touching):
-            cx, cy, cz = contact_impulse(vx, vy, vz, touching, ground.friction, restitution)
-            nx, ny, nz = contact_impulse(cx + ax, cy + ay, cz + az, touching, ground.friction, 0.0)
+            if collide:
+                cx, cy, cz = contact_impulse(vx, vy, vz, touching, ground.friction, ground.restitution)
+            else:
+                cx, cy, cz = vx, vy, vz
+            resting = touching & (cz >= 0.0)  # what comes down now collides at the start of the next step
+            nx, ny, nz = contact_impulse(cx + ax, cy + ay, cz + az, resting, ground.friction, 0.0)
             done = impulse_work(structure.mass[i], vx, vy, vz, ax, ay, az, nx, ny, nz)
             dissipated = select(touching, dissipated - done, dissipated)
         store(v, i, 0, nx)
