@@ -43,7 +43,7 @@ class Structure(NamedTuple):
         """The same structure with its floating-point fields in ``dtype``; itself where they are already."""
         if self.mass.dtype == dtype:
             return self
-        return Structure(*(a.astype(dtype) if a.dtype.kind == "f" else a for a in self))
+        return self._replace(**{name: a.astype(dtype) for name, a in zip(self._fields, self, strict=True) if a.dtype.kind == "f"})
 
     @property
     def n_axial_members(self) -> int:
