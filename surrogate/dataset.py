@@ -1,240 +1,292 @@
-"""The flat HDF5 file of hops: schema, reading with every check, atomic writing, splits that cannot leak."""
+"""The flat HDF5 file of hops: atomic writing, and reading with every check.
+
+The first 512 bytes of a file are text, its *seal*: what it is, and the SHA-256 of all bytes after them. HDF5 readers skip it.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import sys
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
 
+from surrogate.hops import (
+    Configuration,
+    HopData,
+    check_configuration,
+    checksums,
+    chunk_rows,
+    concatenate,
+    digest_of,
+    from_equilibria,
+    from_result,
+    split_share,
+)
+from surrogate.schema import COLUMNS, EVENTS, SCHEMA_VERSION, SPLITS, Column, columns_of, expected_shape
 from surrogate.storage import atomic_path, ensure_folder, hash_of, package_versions
-from tensegrity_gym import ENERGY_NAMES, MODEL_VERSION, Design, HopResult, HopStatus, Lattice, Scene
 from tensegrity_gym.errors import DataFileError
 
-SCHEMA_VERSION = 1
-EVENTS = ("release", "take-off", "touchdown", "end")
-SPLITS = ("train", "validation", "test")
+__all__ = [
+    "COLUMNS",
+    "EVENTS",
+    "SCHEMA_VERSION",
+    "SEAL_BYTES",
+    "SPLITS",
+    "Configuration",
+    "HopData",
+    "attributes",
+    "blocks",
+    "check_configuration",
+    "concatenate",
+    "from_equilibria",
+    "from_result",
+    "read",
+    "seal_of",
+    "split_share",
+    "write",
+    "write_blocks",
+]
 
-
-class Column(NamedTuple):
-    """One data set of the file: the shape after the hop axis (-1: one per actuator), its type, unit and meaning."""
-
-    shape: tuple[int, ...]
-    dtype: str
-    unit: str
-    description: str
-
-
-COLUMNS: dict[str, Column] = {
-    "stretches": Column((-1,), "f8", "1", "lambda: rest length of each actuated cable over the cell's height"),
-    "landing": Column((2,), "f8", "m", "horizontal displacement of the centre of mass, read as scene.landing says"),
-    "rest": Column((2,), "f8", "m", "horizontal displacement of the centre of mass when the hop is over"),
-    "touchdown": Column((2,), "f8", "m", "horizontal displacement of the centre of mass at the first impact after flight"),
-    "rest_nodes": Column((2,), "f8", "m", "as rest, of the mean of the nodes"),
-    "touchdown_nodes": Column((2,), "f8", "m", "as touchdown, of the mean of the nodes"),
-    "apex": Column((), "f8", "m", "rise of the centre of mass above its start"),
-    "takeoff_time": Column((), "f8", "s", "when the last mass leaves the ground"),
-    "takeoff_velocity": Column((3,), "f8", "m/s", "velocity of the centre of mass at take-off"),
-    "touchdown_time": Column((), "f8", "s", "first impact after flight"),
-    "flight_time": Column((), "f8", "s", "touchdown_time - takeoff_time"),
-    "end_time": Column((), "f8", "s", "when the hop is over"),
-    "energies": Column((len(EVENTS), len(ENERGY_NAMES)), "f8", "J", f"at {', '.join(EVENTS)}; columns {', '.join(ENERGY_NAMES)}"),
-    "stored_energy": Column((), "f8", "J", "elastic energy of the equilibrium above that of the unloaded lattice"),
-    "equilibrium_energy": Column((), "f8", "J", "total potential energy of the equilibrium"),
-    "residual": Column((), "f8", "N", "largest force left on a mass in the equilibrium"),
-    "iterations": Column((), "i8", "1", "iterations of form-finding"),
-    "status": Column((), "i8", "1", ", ".join(f"{s.value} {s.name}" for s in HopStatus)),
-    "steps": Column((), "i8", "1", "time steps of the hop"),
-}
-
-
-@dataclass(frozen=True)
-class Configuration:
-    """All that decides what hop number k of a file is; how many hops there are is left out, so that a file can grow."""
-
-    design: Design = field(default_factory=Design)
-    scene: Scene = field(default_factory=Scene)
-    lattice: Lattice = field(default_factory=Lattice)
-    seed: int = 0
-    sampler: str = "sobol"
-    dt: float | None = None  #: [s]; None lets the simulator choose
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON-like content, with the versions of schema and physics."""
-        return {
-            "schema_version": SCHEMA_VERSION,
-            "model_version": MODEL_VERSION,
-            "design": asdict(self.design),
-            "scene": asdict(self.scene),
-            "lattice": asdict(self.lattice),
-            "seed": self.seed,
-            "sampler": self.sampler,
-            "dt": self.dt,
-        }
-
-
-@dataclass(frozen=True)
-class HopData:
-    """Hops as columns (batch first) and the configuration they were made with."""
-
-    columns: dict[str, np.ndarray]
-    configuration: dict[str, Any]
-    seconds: float = 0.0  #: wall time that simulating them took [s]
-
-    def __len__(self) -> int:
-        return len(self.columns["stretches"])
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.columns[name]
-
-    def rows(self, which: slice | np.ndarray) -> HopData:
-        """Some of the hops, by slice, mask or index."""
-        return HopData({name: values[which] for name, values in self.columns.items()}, self.configuration, self.seconds)
-
-    @property
-    def usable(self) -> np.ndarray:
-        """True where the hop is an answer of the physics (it did not blow up and had an equilibrium), shape (n,)."""
-        return ~np.isin(self["status"], (HopStatus.UNSTABLE, HopStatus.NOT_CONVERGED))
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the columns' bytes, so that a flipped bit shows: 64 hex digits."""
-        total = hashlib.sha256()
-        for name in COLUMNS:
-            total.update(name.encode())
-            total.update(np.ascontiguousarray(self.columns[name]).tobytes())
-        return total.hexdigest()
-
-    def split(self, validation: float = 0.1, test: float = 0.1) -> dict[str, np.ndarray]:
-        """Indices of the usable hops of each split, decided by each hop's own stretches.
-
-        Stretches and their images under the lattice's symmetries hash alike, so no hop's image sits in another split.
-        """
-        share = _hash_share(self["stretches"], Lattice(**self.configuration["lattice"]).symmetries)
-        bins = np.digitize(share, (1 - validation - test, 1 - test))
-        return {name: np.nonzero((bins == k) & self.usable)[0] for k, name in enumerate(SPLITS)}
-
-
-def _hash_share(stretches: np.ndarray, symmetries: np.ndarray) -> np.ndarray:
-    """A number in [0, 1) per hop from the hash of the lexicographically least of its images, shape (n,)."""
-    images = np.round(stretches[:, symmetries], 9)  # (n, n_symmetries, n_actuators)
-    share = np.empty(len(stretches))
-    for k, group in enumerate(images):
-        least = min(tuple(row) for row in group.tolist())
-        share[k] = int.from_bytes(hashlib.sha256(np.array(least).tobytes()).digest()[:7], "big") / 2**56
-    return share
-
-
-def from_result(result: HopResult, configuration: Configuration, seconds: float = 0.0) -> HopData:
-    """Columns of a simulated batch."""
-    found = result.equilibria
-    columns = {"equilibrium_energy": found.energy, "residual": found.residual, "iterations": found.iterations}
-    columns |= {name: getattr(result, name) for name in COLUMNS if name not in columns}
-    columns = {name: np.ascontiguousarray(columns[name], dtype=COLUMNS[name].dtype) for name in COLUMNS}
-    return HopData(columns, configuration.as_dict(), seconds)
-
-
-def concatenate(parts: list[HopData]) -> HopData:
-    """Join hops of one configuration."""
-    for part in parts[1:]:
-        _check_configuration(part.configuration, parts[0].configuration, "the second part")
-    columns = {name: np.concatenate([p[name] for p in parts]) for name in COLUMNS}
-    return HopData(columns, parts[0].configuration, sum(p.seconds for p in parts))
+SEAL_BYTES = 512
+#: Group of the columns' checksums, one unsigned number for each chunk of rows.
+CHECKSUMS = "checksums"
 
 
 def write(path: Path | str, data: HopData) -> Path:
     """Write the whole file beside ``path`` and rename it: at every moment there is the old file, or the new one."""
+    return write_blocks(path, data.configuration, [data])
+
+
+def write_blocks(
+    path: Path | str, configuration: dict[str, Any], parts: Iterable[HopData], skipped: Sequence[dict[str, Any]] = ()
+) -> Path:
+    """As :func:`write`, from parts that never need to be in memory together; ``skipped`` chunks are noted in the file."""
     path = Path(path)
     ensure_folder(path.parent)
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        for name, column in COLUMNS.items():
-            values = data[name]
-            kept = file.create_dataset(
-                name, data=values, chunks=values.shape if values.size else None, compression="gzip" if values.size else None
+    schema = columns_of(configuration)
+    with atomic_path(path) as temporary:
+        with h5py.File(temporary, "w", userblock_size=SEAL_BYTES) as file:
+            seconds, hops = 0.0, 0
+            writers = {name: _ColumnWriter(file, name, column) for name, column in schema.items()}
+            for part in parts:
+                seconds, hops = seconds + part.seconds, hops + len(part)
+                for name, writer in writers.items():
+                    writer.append(part[name])
+            sums = {name: writer.close(_tail(schema[name], configuration)) for name, writer in writers.items()}
+            file.attrs.update(
+                {
+                    "schema_version": SCHEMA_VERSION,
+                    "model_version": configuration["model_version"],
+                    "hops": hops,
+                    "wall_seconds": seconds,
+                    "configuration": json.dumps(configuration, sort_keys=True),
+                    "configuration_hash": hash_of(configuration),
+                    **{k: json.dumps(configuration[k], sort_keys=True) for k in ("design", "scene")},
+                    **{k: configuration[k] for k in ("precision", "seed")},
+                    "packages": json.dumps(package_versions()),
+                    "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+                    "date": datetime.now(UTC).isoformat(timespec="seconds"),
+                    "skipped": json.dumps(list(skipped)),
+                    "digest": digest_of(sums, schema),
+                }
             )
-            kept.attrs["unit"] = column.unit
-            kept.attrs["description"] = column.description
-        file.attrs.update(
-            {
-                "schema_version": SCHEMA_VERSION,
-                "model_version": data.configuration["model_version"],
-                "hops": len(data),
-                "wall_seconds": data.seconds,
-                "configuration": json.dumps(data.configuration, sort_keys=True),
-                "configuration_hash": hash_of(data.configuration),
-                "packages": json.dumps(package_versions()),
-                "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-                "date": datetime.now(UTC).isoformat(timespec="seconds"),
-                "digest": data.digest,
-            }
-        )
+        seal = seal_of(temporary)
+        with open(temporary, "r+b") as raw:
+            raw.write(seal)
     return path
 
 
-def read(path: Path | str, expect: Configuration | None = None) -> HopData:
+class _ColumnWriter:
+    """Appends to one data set in whole chunks, whatever the sizes of what comes."""
+
+    def __init__(self, file: h5py.File, name: str, column: Column) -> None:
+        self.file, self.name, self.column = file, name, column
+        self.waiting: list[np.ndarray] = []
+        self.sums: list[np.ndarray] = []
+        self.data: h5py.Dataset | None = None
+
+    def append(self, values: np.ndarray) -> None:
+        self.waiting.append(values)
+        rows = chunk_rows(values)
+        ready = sum(len(v) for v in self.waiting) // rows * rows
+        if ready:
+            joined = np.concatenate(self.waiting)
+            self._store(joined[:ready])
+            self.waiting = [joined[ready:].copy()]
+
+    def close(self, tail: tuple[int, ...]) -> np.ndarray:
+        """Store what waits; returns the checksums of all chunks."""
+        rest = np.concatenate(self.waiting) if self.waiting else np.zeros((0, *tail), self.column.dtype)
+        if len(rest) or self.data is None:
+            self._store(rest)
+        sums = np.concatenate(self.sums)
+        self.file.create_dataset(f"{CHECKSUMS}/{self.name}", data=sums)
+        return sums
+
+    def _store(self, values: np.ndarray) -> None:
+        if self.data is None:
+            self.data = self.file.create_dataset(
+                self.name,
+                shape=(0, *values.shape[1:]),
+                maxshape=(None, *values.shape[1:]),
+                chunks=(chunk_rows(values), *(max(1, k) for k in values.shape[1:])),
+                dtype=np.dtype(self.column.dtype).newbyteorder("<"),
+                compression="gzip",
+                compression_opts=1,
+                shuffle=True,
+            )
+            self.data.attrs["unit"] = self.column.unit
+            self.data.attrs["description"] = self.column.description
+        before = len(self.data)
+        self.data.resize(before + len(values), axis=0)
+        if len(values):
+            self.data[before:] = values
+        self.sums.append(checksums(values, self.column))
+
+
+def _tail(column: Column, configuration: dict[str, Any]) -> tuple[int, ...]:
+    return expected_shape(column, 0, configuration)[1:]
+
+
+def seal_of(path: Path) -> bytes:
+    """The seal that a file must carry for the bytes it has after it."""
+    total = hashlib.sha256()
+    with open(path, "rb") as raw:
+        raw.seek(SEAL_BYTES)
+        while block := raw.read(2**22):
+            total.update(block)
+    text = f"tensegrity_gym hop data: HDF5 from byte {SEAL_BYTES} on\nsha256 of those bytes: {total.hexdigest()}\n"
+    return text.encode().ljust(SEAL_BYTES, b"\n")
+
+
+def read(
+    path: Path | str, expect: Configuration | None = None, *, columns: Sequence[str] | None = None, content: str | None = "hops"
+) -> HopData:
     """Read and check a file: schema, damage and, where ``expect`` is given, that it was made with that configuration.
 
+    ``columns`` reads (and checks) only those, beside ``index``; ``content`` is what the file must hold, None for either.
     Raises DataFileError, which names the file, what was expected and what came.
     """
     path = Path(path)
-    if not path.is_file():
-        raise DataFileError(f"expected a data file at {path}, found none; make it with `python -m surrogate generate {path}`")
-    try:
-        with h5py.File(path, "r") as file:
-            attributes = dict(file.attrs)
-            columns = {name: file[name][()] for name in COLUMNS if name in file}
-    except (OSError, KeyError, RuntimeError) as error:
-        raise DataFileError(
-            f"{path}: expected a whole HDF5 file of hops, but it cannot be read ({error}); generate it again"
-        ) from error
-    data = _checked(path, columns, attributes)
-    if expect is not None:
-        _check_configuration(data.configuration, expect.as_dict(), str(path))
-    return data
+    with _open(path) as file:
+        configuration = _configuration(path, file)
+        if expect is not None:
+            check_configuration(configuration, expect.as_dict(), str(path))
+            content = expect.content
+        if content is not None and configuration.get("content") != content:
+            raise DataFileError(f"{path}: expected a file of {content}, got one of {configuration.get('content')}")
+        schema = columns_of(configuration)
+        wanted = [name for name in schema if columns is None or name == "index" or name in columns]
+        unknown = sorted(set(columns or ()) - set(schema))
+        if unknown:
+            raise DataFileError(f"{path}: expected columns out of {list(schema)}, asked for {unknown}")
+        missing = sorted(set(schema) - set(file))
+        if missing:
+            raise DataFileError(f"{path}: expected the columns {sorted(schema)}, missing {missing}; generate it again")
+        hops = len(file["index"])
+        found = {name: _column(path, file, name, schema[name], hops, configuration) for name in wanted}
+        if columns is None:
+            sums = {name: file[f"{CHECKSUMS}/{name}"][()] for name in schema}
+            _expect(path, "digest", file.attrs.get("digest"), digest_of(sums, schema))
+        return HopData(found, configuration, float(file.attrs.get("wall_seconds", 0.0)))
 
 
-def _checked(path: Path, columns: dict[str, np.ndarray], attributes: dict[str, Any]) -> HopData:
-    version = int(attributes.get("schema_version", -1))
+def blocks(path: Path | str, rows: int = 16 * 1024, start: int = 0, stop: int | None = None) -> Iterator[HopData]:
+    """Rows ``start`` to ``stop`` of a file, some at a time, for what does not fit into memory.
+
+    Chunks are not checked against their checksums: see ``surrogate.check``.
+    """
+    path = Path(path)
+    with _open(path) as file:
+        configuration = _configuration(path, file)
+        names, hops = list(columns_of(configuration)), len(file["index"])
+        seconds = float(file.attrs.get("wall_seconds", 0.0))
+        stop = hops if stop is None else stop
+        for first in range(start, stop, rows):
+            part = {name: file[name][first : min(first + rows, stop)] for name in names}
+            yield HopData(part, configuration, seconds if first == start else 0.0)
+
+
+def attributes(path: Path | str) -> dict[str, Any]:
+    """Root attributes of a file, and ``configuration`` decoded."""
+    path = Path(path)
+    with _open(path) as file:
+        return {**{k: v.item() if isinstance(v, np.generic) else v for k, v in file.attrs.items()}} | {
+            "configuration": _configuration(path, file)
+        }
+
+
+class _open:
+    """An HDF5 file open for reading; whatever HDF5 says of it becomes a DataFileError."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> h5py.File:
+        if not self.path.is_file():
+            raise DataFileError(
+                f"expected a data file at {self.path}, found none; make it with `python -m surrogate generate {self.path}`"
+            )
+        try:
+            self.file = h5py.File(self.path, "r")
+        except (OSError, RuntimeError) as error:
+            raise DataFileError(self._damaged(error)) from error
+        return self.file
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        self.file.close()
+        if error is not None and not isinstance(error, DataFileError) and isinstance(error, (OSError, KeyError, RuntimeError)):
+            raise DataFileError(self._damaged(error)) from error
+
+    def _damaged(self, error: BaseException) -> str:
+        return f"{self.path}: expected a whole HDF5 file of hops, but it cannot be read ({error}); generate it again"
+
+
+def _configuration(path: Path, file: h5py.File) -> dict[str, Any]:
+    version = int(file.attrs.get("schema_version", -1))
     if version != SCHEMA_VERSION:
+        fix = "a newer version of this package made it: upgrade" if version > SCHEMA_VERSION else "generate anew"
         raise DataFileError(
-            f"{path}: expected a hop file of schema {SCHEMA_VERSION}, got {version if version >= 0 else None}; generate anew"
+            f"{path}: expected a hop file of schema {SCHEMA_VERSION}, got {version if version >= 0 else None}; {fix}"
         )
-    missing = sorted(set(COLUMNS) - set(columns))
-    if missing:
-        raise DataFileError(f"{path}: expected the columns {sorted(COLUMNS)}, missing {missing}; generate it again")
     try:
-        configuration = json.loads(attributes["configuration"])
-        n_actuators = Lattice(**configuration["lattice"]).n_cells
+        configuration = json.loads(file.attrs["configuration"])
+        columns_of(configuration)
+        expected_shape(COLUMNS["stretches"], 0, configuration)
     except (KeyError, TypeError, ValueError) as error:
         raise DataFileError(
             f"{path}: expected its configuration as JSON among its attributes ({error}); generate it again"
         ) from error
-    hops = len(columns["stretches"])
-    for name, column in COLUMNS.items():
-        shape = (hops, *(n_actuators if k < 0 else k for k in column.shape))
-        if columns[name].shape != shape or columns[name].dtype != np.dtype(column.dtype):
-            came = f"{columns[name].dtype}{columns[name].shape}"
-            raise DataFileError(f"{path}: expected column {name} as {column.dtype}{shape}, got {came}; generate it again")
-    data = HopData(columns, configuration, float(attributes.get("wall_seconds", 0.0)))
-    if data.digest != attributes.get("digest"):
+    _expect(path, "configuration hash", file.attrs.get("configuration_hash"), hash_of(configuration))
+    return configuration
+
+
+def _column(path: Path, file: h5py.File, name: str, column: Column, hops: int, configuration: dict[str, Any]) -> np.ndarray:
+    """One whole column, checked; the length of trajectories is what the file says."""
+    stored = file[name]
+    frames = stored.shape[1] if stored.ndim > 1 else 0
+    shape = expected_shape(column, hops, configuration, frames)
+    if stored.shape != shape or stored.dtype != np.dtype(column.dtype):
+        came = f"{stored.dtype}{stored.shape}"
+        raise DataFileError(f"{path}: expected column {name} as {column.dtype}{shape}, got {came}; generate it again")
+    values = stored[()].astype(np.dtype(column.dtype), copy=False)
+    sums, kept = checksums(values, column), file[f"{CHECKSUMS}/{name}"][()]
+    if not np.array_equal(sums, kept):
+        rows = chunk_rows(values)
+        bad = np.flatnonzero(sums != kept)[:8].tolist() if len(sums) == len(kept) else "of another number"
         raise DataFileError(
-            f"{path}: expected checksum {attributes.get('digest')}, got {data.digest}: damaged; generate it again"
+            f"{path}: column {name}: checksum of chunks {bad} (of {rows} rows each) does not match what was written: damaged; "
+            "generate it again"
         )
-    return data
+    return values
 
 
-def _check_configuration(came: dict[str, Any], expected: dict[str, Any], where: str) -> None:
-    if came == expected:
-        return
-    different = [k for k in sorted(set(came) | set(expected)) if came.get(k) != expected.get(k)]
-    pairs = "; ".join(f"{k}: expected {expected.get(k)!r}, got {came.get(k)!r}" for k in different)
-    raise DataFileError(
-        f"{where} was made from configuration {hash_of(came)}, this run is configuration {hash_of(expected)} ({pairs}); "
-        "choose another file name, or the settings it was made with"
-    )
+def _expect(path: Path, what: str, kept: Any, came: str) -> None:
+    if kept != came:
+        raise DataFileError(f"{path}: expected {what} {kept}, got {came}: damaged; generate it again")

@@ -1,7 +1,9 @@
-"""Folders and files that are either whole or not there."""
+"""Folders and files that are either whole or not there, and locks that die with their holder."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -12,8 +14,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from tensegrity_gym.errors import DataFileError, OutputFolderError
+from tensegrity_gym.errors import DataFileError, FileInUseError, OutputFolderError
 
+#: Reasons for which the system refuses to write: no space, no quota, file too large, read-only.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 PACKAGES = ("numpy", "numba", "scipy", "h5py", "gymnasium", "torch", "stable-baselines3")
 
 
@@ -33,7 +37,10 @@ def ensure_folder(folder: Path | str) -> Path:
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; it takes the name ``path`` only when the block ends well."""
+    """Yield a temporary path beside ``path``; it takes the name ``path`` only when the block ends well.
+
+    OutputFolderError when the system has no room for it.
+    """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -41,8 +48,70 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         with open(temporary, "rb") as written:
             os.fsync(written.fileno())
         os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        if isinstance(error, DataFileError) or not _no_room(error):
+            raise
+        raise OutputFolderError(
+            f"expected room to write {path}, got: {error}; free some, or choose another folder; nothing was overwritten"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _no_room(error: OSError) -> bool:
+    # h5py tells the reason in words alone
+    return error.errno in NO_ROOM or any(f"errno = {code}" in str(error) for code in NO_ROOM)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename last through a power cut, where the system can."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EBADF):  # some file systems sync no folders
+            raise
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def writer_lock(path: Path | str) -> Iterator[None]:
+    """Hold the right to write ``path``; FileInUseError if another process has it. The lock goes when its holder dies."""
+    lock = Path(path).with_name(f".{Path(path).name}.lock")
+    descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
+            raise FileInUseError(
+                f"expected to be the only writer of {path}, but process {holder} is at it; wait for it, or choose another file"
+            ) from error
+        if not _same_file(descriptor, lock):  # the last holder took it away between our open and our lock
+            raise FileInUseError(f"expected to be the only writer of {path}, but another one has just ended; run this again")
+        os.truncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+    finally:
+        os.close(descriptor)
+
+
+def _same_file(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def remove_partials(folder: Path, name: str) -> None:
+    """Remove what killed writers of ``name`` left half written; call it as the only writer."""
+    for left in folder.glob(f".{name}.*.partial"):
+        left.unlink(missing_ok=True)
 
 
 def write_json(path: Path | str, content: Any) -> None:

@@ -36,3 +36,11 @@ class ResetNeededError(TensegrityError, RuntimeError):
 
 class MissingExtraError(TensegrityError, ImportError):
     """Something was asked for that needs an optional package which is not installed."""
+
+
+class FileInUseError(TensegrityError, OSError):
+    """Another process is writing the file that was asked for."""
+
+
+class SkippedChunksError(TensegrityError, RuntimeError):
+    """Some chunks of hops failed again and again and were left out; all others are in the file."""

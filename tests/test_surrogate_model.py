@@ -11,7 +11,7 @@ import torch
 
 from surrogate import model
 from surrogate.correction import fit_correction
-from surrogate.dataset import COLUMNS, Configuration, HopData
+from surrogate.dataset import COLUMNS, Configuration, HopData, split_share
 from surrogate.evaluate import rmse, spread
 from surrogate.generate import sample_stretches
 from surrogate.model import OUTPUTS, HopNet, NetConfig
@@ -34,6 +34,7 @@ def closed_form_data(hops: int, seed: int = 0) -> HopData:
     cells = LATTICE.cells - LATTICE.cells.mean(axis=0)
     columns = {name: np.zeros((hops, *(4 if k < 0 else k for k in c.shape)), dtype=c.dtype) for name, c in COLUMNS.items()}
     columns["stretches"] = stretches
+    columns["split_share"] = split_share(stretches, LATTICE)
     columns["landing"] = 0.4 * (centred @ cells) * (1 - 0.3 * centred.mean(axis=1, keepdims=True))
     columns["touchdown"] = 0.2 * columns["landing"]
     columns["apex"] = 1.0 - 0.5 * centred.mean(axis=1)

@@ -1,0 +1,117 @@
+"""Who works the chunks off: threads of this process, workers of this machine, or a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from typing import Any
+
+from surrogate.chunks import Progress, Task
+from surrogate.hops import HopData
+from tensegrity_gym.errors import InvalidParameterError, MissingExtraError, TensegrityError
+
+#: What a chunk came to: its data, or what went wrong each time it was tried.
+Outcome = tuple[Task, HopData | Exception]
+#: A worker that dies takes its chunk along; a chunk that outlived no worker this often is poison.
+DEATHS = 2
+#: Chunks in flight per worker: one at work, one waiting.
+AHEAD = 2
+
+
+def run_here(
+    tasks: Iterable[Task], work: Callable[..., HopData], threads: int | None, retries: int, progress: Progress
+) -> Iterator[Outcome]:
+    """One chunk after the other on ``threads`` threads."""
+    for task in tasks:
+        outcome: HopData | Exception = RuntimeError("never tried")
+        for _ in range(retries + 1):
+            counted = 0
+
+            def count(hops: int) -> None:
+                nonlocal counted
+                counted += hops
+                progress(hops)
+
+            try:
+                outcome = work(task, threads=threads, progress=count)
+            except TensegrityError:  # asked for what cannot be: every chunk would say the same
+                raise
+            except Exception as error:  # whatever else a chunk does is its own
+                progress(-counted)
+                outcome = error
+                continue
+            progress(task.last - task.first - counted)
+            break
+        yield task, outcome
+
+
+def run_on_cluster(
+    tasks: Iterable[Task], work: Callable[..., HopData], address: str, workers: int | None, retries: int, progress: Progress
+) -> Iterator[Outcome]:
+    """Chunks as tasks of a dask cluster: one made here for ``address`` "dask", or the scheduler at tcp://host:port.
+
+    Each worker takes one chunk at a time, on one thread of its own. A killed worker's chunk goes to another one.
+    """
+    distributed = _distributed()
+    with _client(distributed, address, workers) as client:
+        waiting = iter(tasks)
+        ready = distributed.as_completed(raise_errors=False)
+        of: dict[str, Task] = {}
+
+        def send(count: int) -> None:
+            for task in islice(waiting, count):
+                future = client.submit(work, task, threads=1, retries=retries, pure=False, key=f"hops-{task.first}-{task.last}")
+                of[future.key] = task
+                ready.add(future)
+
+        send(AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])))
+        for future in ready:
+            task = of.pop(future.key)
+            error = future.exception()
+            if isinstance(error, TensegrityError):
+                raise error
+            outcome = future.result() if error is None else error
+            future.release()  # else the cluster keeps every chunk
+            send(1)
+            progress(task.last - task.first)
+            yield task, outcome
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError as error:
+        raise MissingExtraError(
+            "scheduler: expected dask and distributed to be installed, they are not; pip install 'tensegrity-gym[cluster]'"
+        ) from error
+    return distributed
+
+
+def _client(distributed: Any, address: str, workers: int | None) -> Any:
+    import dask
+
+    dask.config.set({"distributed.scheduler.allowed-failures": DEATHS})
+    if address == "dask":
+        cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None)
+        client = distributed.Client(cluster, set_as_default=False)
+        return _Both(client, cluster)
+    if "://" not in address:
+        raise InvalidParameterError(f"scheduler: expected threads, dask or an address such as tcp://host:8786, got {address!r}")
+    try:
+        return distributed.Client(address, timeout="30s", set_as_default=False)
+    except OSError as error:
+        raise InvalidParameterError(f"scheduler: expected a dask scheduler at {address}, found none ({error})") from error
+
+
+class _Both:
+    """A client and the cluster that was made for it, closed together."""
+
+    def __init__(self, client: Any, cluster: Any) -> None:
+        self.client, self.cluster = client, cluster
+
+    def __enter__(self) -> Any:
+        return self.client
+
+    def __exit__(self, *_: Any) -> None:
+        self.client.close()
+        self.cluster.close()
