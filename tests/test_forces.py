@@ -57,7 +57,17 @@ def distance_from_slack(c: Case) -> float:
     return float(np.abs(cable_stretch(c)).min())
 
 
+def hinges_first(c: Case) -> Case:
+    """The same with axial stiffness, damping and gravity's masses so small that nothing hides the hinges."""
+    s = c.structure
+    names = ("segment_stiffness", "segment_damping", "cable_stiffness", "cable_damping", "actuator_rigidity", "mass")
+    soft = s._replace(**{name: 1e-6 * getattr(s, name) for name in names}, inverse_mass=1e6 * s.inverse_mass)
+    return c._replace(structure=soft)
+
+
 CASES = [
+    hinges_first(case((1, 1), noise=0.01, seed=10)),
+    hinges_first(case((1, 1), segments=5, noise=0.01, seed=11)),
     case((1, 1)),
     case((2, 1), seed=1),
     case((2, 2), noise=0.02, seed=2),

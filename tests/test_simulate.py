@@ -165,6 +165,29 @@ def test_in_flight_nothing_touches_the_ground_and_at_touchdown_something_does() 
         assert lowest[after] < 0.02  # m; within one frame of 4 ms of the ground
 
 
+def test_take_off_and_touchdown_are_when_a_plain_loop_sees_them() -> None:
+    """The hop again, step by step: positions are of n dt; contact is where the lowest mass's straight path meets z = 0."""
+    hop, r = 2, hops()
+    x, dt, ground = equilibria().positions[hop].copy(), r.dt, EARTH.ground
+    v, f, losses, memory = np.zeros_like(x), np.zeros_like(x), np.zeros(3), np.zeros(STRUCTURE.n_axial_members)
+    lengths, done, seen = STRUCTURE.actuator_length, 0, []
+    for event in (r.takeoff_time[hop], r.touchdown_time[hop]):
+        near = int(event / dt) - 20
+        kernels.advance(STRUCTURE, lengths, ground, dt, dt if done else 0.5 * dt, near - done, x, v, f, memory, losses)
+        done = near
+        for _ in range(40):
+            before = x[:, 2].min()
+            kernels.advance(STRUCTURE, lengths, ground, dt, dt, 1, x, v, f, memory, losses)
+            done += 1
+            after = x[:, 2].min()
+            if (before > 0) != (after > 0):
+                seen.append((done, before, after))
+    (took_off, _, height), (landed, before, after) = seen[0], seen[-1] if len(seen) == 2 else seen[1]
+    assert height > 0 >= after
+    assert r.takeoff_time[hop] == pytest.approx((took_off - 0.5) * dt, rel=1e-12)
+    assert r.touchdown_time[hop] == pytest.approx((landed - 1 + before / (before - after)) * dt, rel=1e-12)
+
+
 @pytest.mark.parametrize("spin", [0.0, 3.0])
 def test_momentum_and_angular_momentum_of_a_lattice_in_space(spin: float) -> None:
     """Released from compression without ground or gravity: P and L about the centre keep to 1e-9 while it vibrates.
