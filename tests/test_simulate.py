@@ -247,12 +247,15 @@ def test_a_queued_hop_starts_afresh_in_a_used_lane() -> None:
 
 @pytest.mark.parametrize("element", [1, 2, 3])
 def test_permuted_stretches_land_at_the_image(element: int) -> None:
-    """d(s)[x, y] = signs * d(s[symmetry]): to 1e-3 m, the scatter of a touchdown whose start differs by 1e-8 m or less."""
+    """d(s)[x, y] = signs * d(s[symmetry]): starts agree to 1e-8 m, and flight amplifies that by some hundreds (docs/physics.md).
+
+    Only touchdown: after it, tumbling amplifies round-off a million times.
+    """
     signs = LATTICE.symmetry_signs[element]
     r = hops()
     image = r.touchdown[4 + element] * signs
-    np.testing.assert_allclose(r.touchdown[1], image, rtol=0, atol=1e-3)
-    assert r.apex[1] == pytest.approx(r.apex[4 + element], abs=1e-3)
+    np.testing.assert_allclose(r.touchdown[1], image, rtol=0, atol=1e-5)
+    assert r.apex[1] == pytest.approx(r.apex[4 + element], abs=1e-5)
     assert np.linalg.norm(r.touchdown[1]) > 5e-3  # it does go somewhere
 
 
