@@ -1,4 +1,4 @@
-"""Equilibria of the compressed lattice at rest on the ground: validate, minimise, report convergence."""
+"""Equilibria of the compressed lattice at rest on the ground: validate, search, report convergence."""
 
 from __future__ import annotations
 
@@ -7,24 +7,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tensegrity_gym.batch import Progress, run_shares
-from tensegrity_gym.core.lanes import lane_count, lanes_empty
-from tensegrity_gym.core.newton import N_SCALARS, EquilibriumRecords, NewtonLanes, NewtonSettings, newton_equilibria
+from tensegrity_gym.batch import Progress
 from tensegrity_gym.design import Design
-from tensegrity_gym.elimination import lattice_pattern
 from tensegrity_gym.energies import elastic_energies, member_forces
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
+from tensegrity_gym.searches import SEARCHES, TOLERANCE, Found, Problem, SearchOptions, imperfection_forces, start_positions
 from tensegrity_gym.types import Floats, Structure
 
+__all__ = [
+    "METHODS",
+    "STRETCH_RANGE",
+    "TOLERANCE",
+    "Equilibria",
+    "SearchOptions",
+    "as_stretches",
+    "form_find",
+    "imperfection_forces",
+    "start_positions",
+]
 #: The stretches that the design is meant for, the paper's range.
 STRETCH_RANGE = (0.2, 0.8)
-METHODS = ("newton",)
-#: The load that decides which way a bar bows, over the bar's Euler load: downwards, as a bar's own weight does on Earth.
-IMPERFECTION = 1e-5
-#: Residual force per mass at which an equilibrium counts as found, over the Euler load of a bar.
-TOLERANCE = 1e-8
+#: What can be asked of form-finding with ``outside=True``: a cable has a length, and slack ones need not be longer than this.
+WIDEST_RANGE = (0.01, 2.0)
+METHODS = tuple(SEARCHES)
+DAMPINGS = ("viscous", "kinetic")
+#: Offset of a bar's bow from the vertical plane through its ends, over the bar's length, above which it has a side.
+SIDEWAYS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -43,11 +53,40 @@ class Equilibria:
     bar_load: Floats  #: compression, mean over the bar's segments [N], shape (n, n_bars)
     contact_force: Floats  #: normal force of the ground on each mass [N], shape (n, n_masses)
     method: str  #: how they were found
+    evaluations: np.ndarray  #: of the energy or of the forces, shape (n,)
+    tolerance: float  #: residual asked for [N]
+    max_iterations: int  #: cap of the method
 
     @property
     def stored_energy(self) -> Floats:
         """Elastic energy [J], shape (n,)."""
         return self.energies["bars"] + self.energies["cables"] + self.energies["actuators"]
+
+    @property
+    def hints(self) -> list[str]:
+        """Why each equilibrium was not found and what to try; empty where it was found."""
+        return [self._hint(row) for row in range(len(self.stretches))]
+
+    def _hint(self, row: int) -> str:
+        if self.converged[row]:
+            return ""
+        low, high = STRETCH_RANGE
+        found = f"{self.method}: residual {self.residual[row]:.3g} N after {self.iterations[row]} iterations"
+        asked = f"expected at most {self.tolerance:.3g} N"
+        values = self.stretches[row]
+        if (values < low - 1e-6).any() or (values > high + 1e-6).any():
+            fix = (
+                f"stretches {values.tolist()} leave [{low:g}, {high:g}], where the lattice may collapse or hang slack: clip them"
+            )
+        elif not np.isfinite(self.residual[row]):
+            fix = "the search ran away: check the design's stiffnesses, or start from given positions (start=...)"
+        elif self.iterations[row] >= self.max_iterations:
+            fix = f"the cap is {self.max_iterations}: raise max_iterations, or take a smaller load_step (method 'newton')"
+        else:
+            fix = (
+                "the energy's rounding hides the slope, or masses chatter on the ground: loosen tolerance or use method 'newton'"
+            )
+        return f"{found}, {asked}; {fix}"
 
 
 def as_stretches(stretches: ArrayLike, lattice: Lattice, low: float = STRETCH_RANGE[0], high: float = STRETCH_RANGE[1]) -> Floats:
@@ -75,36 +114,6 @@ def as_stretches(stretches: ArrayLike, lattice: Lattice, low: float = STRETCH_RA
     return np.clip(values, low, high)
 
 
-def start_positions(design: Design, lattice: Lattice, bow: float = 1e-3) -> Floats:
-    """The unloaded lattice standing on the ground, its bars bowed downwards by ``bow`` of their length, (n_masses, 3) [m]."""
-    x = design.unloaded_positions(lattice)
-    x[:, 2] -= x[:, 2].min()
-    structure = design.structure(lattice)
-    axis = x[structure.bars[:, -1]] - x[structure.bars[:, 0]]
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    down = np.array((0.0, 0.0, -1.0)) + axis[:, 2:] * axis
-    down /= np.linalg.norm(down, axis=1, keepdims=True)
-    x[structure.bars[:, 1:-1]] += bow * design.bar_length * down[:, None, :]
-    x[x[:, 2] < 1e-9, 2] = 0.0
-    return x
-
-
-def imperfection_forces(design: Design, structure: Structure) -> Floats:
-    """Self-balanced dead load that bows each bar downwards, shape (n_masses, 3) [N].
-
-    Without gravity the bow of a pin-ended bar may point anywhere around its chord; this settles it and, pointing down,
-    keeps every symmetry of the lattice on the ground.
-    """
-    forces = np.zeros((len(structure.mass), 3))
-    inner = structure.bars[:, 1:-1]
-    if inner.shape[1]:
-        load = IMPERFECTION * design.critical_load
-        forces[inner.ravel(), 2] -= load
-        for end in (0, -1):
-            np.add.at(forces[:, 2], structure.bars[:, end], load * inner.shape[1] / 2)
-    return forces
-
-
 def form_find(
     stretches: ArrayLike,
     *,
@@ -112,85 +121,82 @@ def form_find(
     scene: Scene | None = None,
     lattice: Lattice | None = None,
     method: str = "newton",
+    options: SearchOptions | None = None,
+    start: Floats | None = None,
+    outside: bool = False,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Equilibria:
     """Equilibria of the lattice compressed to ``stretches``, (n_actuators,) or (n, n_actuators), at rest on the ground.
 
     The energy is elastic plus gravitational, the ground a unilateral constraint without friction; on a slope the lattice is
-    held against sliding until its release, so only gravity along the normal enters. Each equilibrium is the end of the load
-    path on which all actuators shorten together from the unloaded lattice, so it does not depend on the rest of the batch.
+    held against sliding until its release, so only gravity along the normal enters. With ``method`` "newton" each equilibrium
+    is the end of the load path on which all actuators shorten together from the unloaded lattice, so it does not depend on the
+    rest of the batch. "cg" and "relaxation" are the baselines of the literature: they start unloaded under the full load and
+    may end in another equilibrium. ``start`` (n, n_masses, 3) [m] replaces the start of any method, load path included.
+    ``outside=True`` also takes stretches outside the paper's range, where equilibria may be lost.
 
-    Raises InvalidStretchesError and InvalidParameterError. What did not converge says so in ``converged``; never use it.
+    Raises InvalidStretchesError and InvalidParameterError. What did not converge says so in ``converged``, and why in
+    ``hints``; never use it.
     """
     design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
-    values = as_stretches(stretches, lattice)
+    values = as_stretches(stretches, lattice, *(WIDEST_RANGE if outside else STRETCH_RANGE))
     if method not in METHODS:
         raise InvalidParameterError(f"form_find: expected method in {METHODS}, got {method!r}")
     structure = design.structure(lattice)
-    records = _newton(values, design, scene, lattice, structure, threads, progress)
-    positions = _canonical_pose(records.positions, design, lattice, structure)
-    return _report(values, positions, records, scene, structure, method)
+    begin = None if start is None else _as_start(start, len(values), len(structure.mass))
+    problem = Problem(values, begin, design, scene, lattice, structure)
+    found = SEARCHES[method](problem, _as_options(options), threads, progress)
+    positions = _canonical_pose(_canonical_bows(found.positions, lattice, design), design, lattice, structure)
+    return _report(values, positions, found, scene, structure, method)
 
 
-def _newton(
-    values: Floats,
-    design: Design,
-    scene: Scene,
-    lattice: Lattice,
-    structure: Structure,
-    threads: int | None,
-    progress: Progress | None,
-) -> EquilibriumRecords:
-    n, m = len(values), len(structure.mass)
-    pattern = lattice_pattern(lattice, int(design.bar_segments))
-    normal_gravity = np.array((0.0, 0.0, scene.gravity_vector[2]))
-    dead_load = imperfection_forces(design, structure)
-    weight = structure.mass.sum() * abs(normal_gravity[2])
-    settings = NewtonSettings(
-        load_step=0.05,
-        path_tolerance=0.02 * design.critical_load,
-        tolerance=TOLERANCE * design.critical_load,
-        max_iterations=2000,
-        longest_step=0.03 * design.cell_height,
-        least_shift=1e-5 * design.critical_load / design.bar_length,
-        unload=1.0,
-        soft_ground=weight / (1e-3 * design.cell_height),
-        max_rounds=100,
-    )
-    records = EquilibriumRecords(
-        positions=np.repeat(start_positions(design, lattice)[None], n, axis=0),
-        forces=np.zeros((n, m, 3)),
-        residual=np.zeros(n),
-        iterations=np.zeros(n, dtype=np.int64),
-        converged=np.zeros(n, dtype=np.bool_),
-        least_pivot=np.zeros(n),
-    )
-
-    def work(first: int, last: int, counter: np.ndarray) -> None:
-        lanes = newton_lanes(structure, pattern.n_slots)
-        newton_equilibria(structure, pattern, normal_gravity, dead_load, settings, values, records, lanes, first, last, counter)
-
-    run_shares(work, n, threads, lane_count(np.float64), progress)
-    return records
+def _as_start(start: Floats, n: int, n_masses: int) -> Floats:
+    positions = np.asarray(start, dtype=np.float64)
+    positions = positions[None] if positions.ndim == 2 else positions
+    if positions.shape != (n, n_masses, 3) or not np.isfinite(positions).all():
+        raise InvalidParameterError(
+            f"form_find: expected start of {n} x {n_masses} x 3 finite positions, got shape {np.shape(start)}"
+        )
+    return positions
 
 
-def newton_lanes(structure: Structure, n_slots: int) -> NewtonLanes:
-    """Work arrays of one thread."""
-    count, n_masses = lane_count(np.float64), len(structure.mass)
-    return NewtonLanes(
-        *(lanes_empty((n_masses, 3)) for _ in range(4)),
-        lanes_empty((structure.n_axial_members,)),
-        lanes_empty((n_masses, 3)),
-        lanes_empty((n_slots, 9)),
-        lanes_empty((len(structure.actuators),)),
-        lanes_empty((N_SCALARS,)),
-        np.zeros(count, dtype=np.int64),
-        np.zeros(count, dtype=np.int64),
-        np.zeros(count),
-        np.zeros(count, dtype=np.int64),
-        lanes_empty((n_masses,)),
-    )
+def _as_options(options: SearchOptions | None) -> SearchOptions:
+    options = options or SearchOptions()
+    for name in ("tolerance", "max_iterations", "load_step", "line_tolerance", "line_cap"):
+        value = getattr(options, name)
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InvalidParameterError(f"SearchOptions.{name}: expected a finite number > 0, got {value!r}")
+    if options.damping not in DAMPINGS:
+        raise InvalidParameterError(f"SearchOptions.damping: expected one of {DAMPINGS}, got {options.damping!r}")
+    return options
+
+
+def _canonical_bows(positions: Floats, lattice: Lattice, design: Design) -> Floats:
+    """Bows that lie sideways on the ground, mirrored to point towards their cell's axis.
+
+    The mirror image of a bow in the vertical plane through its bar's ends has the same energy and the same forces on the ends:
+    a lattice with k bows on the ground has 2^k equilibria of one energy, of which this picks one.
+    """
+    x = positions.copy()
+    first = lattice.n_nodes + 2 * lattice.n_cells
+    per_bar = int(design.bar_segments) - 1
+    if per_bar == 0:
+        return x
+    inner = first + np.arange(per_bar * len(lattice.bars)).reshape(len(lattice.bars), per_bar)
+    near, far = x[:, lattice.bars[:, 0]], x[:, lattice.bars[:, 1]]
+    chord = far - near
+    normal = np.stack([-chord[:, :, 1], chord[:, :, 0]], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    cells = np.stack([x[:, lattice.cell_node_indices(cell), :2].mean(axis=1) for cell in range(lattice.n_cells)], axis=1)
+    own = np.repeat(np.arange(lattice.n_cells), len(lattice.bars) // lattice.n_cells)
+    outwards = np.einsum("nbc,nbc->nb", normal, 0.5 * (near + far)[:, :, :2] - cells[:, own])
+    offset = np.einsum("nbc,nbkc->nbk", normal, x[:, inner, :2] - near[:, :, None, :2])
+    mean = offset.mean(axis=2)
+    flip = (mean * outwards > 0.0) & (np.abs(mean) > SIDEWAYS * design.bar_length)
+    shift = np.where(flip[:, :, None, None], -2.0 * offset[..., None] * normal[:, :, None, :], 0.0)
+    x[:, inner, :2] += shift
+    return x
 
 
 def _canonical_pose(positions: Floats, design: Design, lattice: Lattice, structure: Structure) -> Floats:
@@ -210,26 +216,27 @@ def _canonical_pose(positions: Floats, design: Design, lattice: Lattice, structu
     return turned
 
 
-def _report(
-    values: Floats, positions: Floats, records: EquilibriumRecords, scene: Scene, structure: Structure, method: str
-) -> Equilibria:
+def _report(values: Floats, positions: Floats, found: Found, scene: Scene, structure: Structure, method: str) -> Equilibria:
     lengths = values * structure.actuator_length
     flat = replace(scene, slope=0.0, gravity=scene.gravity * np.cos(scene.slope))
     energies = elastic_energies(structure, positions, lengths)
     energies["gravitational"] = -np.einsum("m,nmc,c->n", structure.mass, positions, flat.gravity_vector)
     forces = member_forces(structure, positions, lengths)
-    pressed = (positions[:, :, 2] <= 0.0) & (records.forces[:, :, 2] < 0.0)
+    pressed = (positions[:, :, 2] <= 0.0) & (found.forces[:, :, 2] < 0.0)
     return Equilibria(
         stretches=values,
         positions=positions,
-        converged=records.converged,
-        iterations=records.iterations,
-        residual=records.residual,
-        energy=sum(energies.values()),
+        converged=found.converged,
+        iterations=found.iterations,
+        residual=found.residual,
+        energy=np.sum(list(energies.values()), axis=0),
         energies=energies,
         cable_tension=forces.cables,
         actuator_tension=forces.actuators,
         bar_load=forces.bars,
-        contact_force=np.where(pressed, -records.forces[:, :, 2], 0.0),
+        contact_force=np.where(pressed, -found.forces[:, :, 2], 0.0),
         method=method,
+        evaluations=found.evaluations,
+        tolerance=found.tolerance,
+        max_iterations=found.max_iterations,
     )

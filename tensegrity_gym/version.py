@@ -4,4 +4,4 @@
 __version__ = "0.1.0"
 
 #: Version of the model: raised by whatever changes a landing. Data, checkpoints and results carry it.
-MODEL_VERSION = "1"
+MODEL_VERSION = "2"

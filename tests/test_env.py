@@ -271,7 +271,7 @@ def test_reach_is_measured_and_saved(tmp_path: Path) -> None:
     scene = Scene(duration=1.2)
     measured = measure_reach(scene, hops=8)
     landings = simulate(STRETCHES_OF_8, scene=scene).touchdown
-    assert measured["touchdown"].radius <= np.linalg.norm(landings, axis=1).max()
+    assert measured["touchdown"].radius <= np.linalg.norm(landings, axis=1).max() + 1e-9  # stretches differ by an ulp
     assert measured["touchdown"].radius >= np.median(np.linalg.norm(landings, axis=1))
     symmetric = np.array(measured["touchdown"].boundary)
     np.testing.assert_allclose(symmetric, np.roll(symmetric[::-1], 1), rtol=1e-9)  # y to -y

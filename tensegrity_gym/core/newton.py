@@ -1,9 +1,14 @@
-"""Damped Newton for equilibria on the ground, a batch at a time: exact tangent, sparse Cholesky, active set for z >= 0.
+"""Newton for equilibria on the ground, a batch at a time: mixed steps, sparse Cholesky, active set for z >= 0.
 
 Each lane is a state machine of its own. It follows its load path from the unloaded lattice (all stretches 1) to its target
 stretches on a soft ground (a one-sided quadratic penalty); then it polishes on the rigid ground: the masses that sank are held
-at z = 0, the rest is free, and only at an equilibrium does the set change, by the sign of gap and contact force. A step solves
-(H + mu I) d = -g, is cut to a trust length, and is taken if the energy falls as predicted; mu rises and falls with that.
+at z = 0, the rest is free, and only at an equilibrium does the set change, by the sign of gap and contact force.
+
+A step solves (H + mu I) d = -g and is cut to a trust length. The geometric stiffness in H is made with the tensions that the
+step before predicted, k (l + n . d - l0), not with those that its second-order error in the lengths of stiff members leaves
+behind: tensions are unknowns of their own, as in a mixed formulation (Magisano, Leonetti and Garcea 2017, "mixed integration
+point" Newton), and a step may bend bars far. Energies then fall only every few steps: a lane keeps going for ``patience`` steps
+before it goes back to its anchor, the last positions of lowest energy, with a larger mu.
 """
 
 from __future__ import annotations
@@ -13,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from tensegrity_gym.core.cholesky import factorise, solve
-from tensegrity_gym.core.energy import actuator_energy, bar_energy, cable_energy, gravitational_energy
-from tensegrity_gym.core.forces import dot, lattice_forces
+from tensegrity_gym.core.forces import dot
 from tensegrity_gym.core.jit import jit
-from tensegrity_gym.core.lanes import fma, load, load1, select, splat, sqrt, store, store1
-from tensegrity_gym.core.tangent import lattice_tangent
+from tensegrity_gym.core.lanes import load, load1, select, splat, sqrt, store, store1
+from tensegrity_gym.core.statics import Statics, static_energy, static_forces
+from tensegrity_gym.core.tangent import axial_tensions, lattice_tangent
 
 
 class NewtonSettings(NamedTuple):
@@ -31,6 +36,9 @@ class NewtonSettings(NamedTuple):
     least_shift: float  #: smallest mu [N/m]: holds the rigid motions, far below the softest real stiffness
     unload: float  #: 1 where the path starts unloaded; 0 to start from the given positions at full load
     soft_ground: float  #: stiffness of the penalty on the way [N/m]
+    most_compression: float  #: of a bar's segment in the tangent: no bar carries much more than its critical load [N]
+    patience: int  #: steps without a fall of energy before going back
+    first_shift: float  #: mu after the first failure [N/m]
     max_rounds: int  #: changes of the set of held masses
 
 
@@ -49,7 +57,7 @@ class NewtonLanes(NamedTuple):
     """Work arrays of one thread."""
 
     x: np.ndarray  #: positions [m], shape (n_masses, 3, lanes)
-    trial: np.ndarray  #: positions tried, shape (n_masses, 3, lanes)
+    anchor: np.ndarray  #: the last positions of falling energy, shape (n_masses, 3, lanes)
     still: np.ndarray  #: zero velocities, shape (n_masses, 3, lanes)
     f: np.ndarray  #: forces [N], shape (n_masses, 3, lanes)
     memory: np.ndarray  #: of damping forces, all zero here, shape (n_axial_members, lanes)
@@ -61,54 +69,21 @@ class NewtonLanes(NamedTuple):
     iterations: np.ndarray  #: factorisations taken for it, shape (lanes,)
     share: np.ndarray  #: progress along its load path, 0 to 1, shape (lanes,)
     rounds: np.ndarray  #: how often its held masses were chosen, shape (lanes,)
+    tension: np.ndarray  #: of axial members, independent of positions [N], shape (n_axial_members, lanes)
+    anchor_tension: np.ndarray  #: that of the anchor, shape (n_axial_members, lanes)
+    strayed: np.ndarray  #: steps since the anchor, -1 for none yet, shape (lanes,)
     held: np.ndarray  #: 1.0 where the rigid ground holds a mass at z = 0, shape (n_masses, lanes)
 
 
-ENERGY, SHIFT, RESIDUAL, PIVOT, TRIAL, SLOPE, CUT = 0, 1, 2, 3, 4, 5, 6
+ENERGY, SHIFT, RESIDUAL, PIVOT, ANCHOR, SLOPE, CUT = 0, 1, 2, 3, 4, 5, 6
 N_SCALARS = 7
 FIXED = 1e15  #: added to the tangent of a coordinate held by the ground [N/m]
 
 
 @jit(forceinline=False)
-def static_energy(structure, settings, gravity, load_forces, lanes, x):
-    """Elastic and gravitational energy, the potential of dead loads and of the soft ground [J]."""
-    total = bar_energy(structure, x) + cable_energy(structure, x) + actuator_energy(structure, lanes.actuator_length, x)
-    total = total + gravitational_energy(structure, gravity, x)
-    zero = total * 0.0
-    for i in range(structure.mass.shape[0]):
-        for c in range(3):
-            total = fma(-load_forces[i, c], load(x, i, c), total)
-        sunk = load(x, i, 2)
-        sunk = select(sunk < 0.0, sunk, zero)
-        total = fma(0.5 * settings.soft_ground * sunk, sunk, total)
-    return total
-
-
-@jit(forceinline=False)
-def free_forces(structure, settings, gravity, load_forces, lanes):
-    """Fill f with all forces but the rigid ground's; set RESIDUAL to the largest force on a mass that it does not take."""
-    lattice_forces(structure, lanes.actuator_length, gravity, lanes.x, lanes.still, lanes.f, lanes.memory)
-    zero = load(lanes.x, 0, 0) * 0.0
-    worst = zero
-    for i in range(structure.mass.shape[0]):
-        sunk = load(lanes.x, i, 2)
-        sunk = select(sunk < 0.0, sunk, zero)
-        fx = load(lanes.f, i, 0) + load_forces[i, 0]
-        fy = load(lanes.f, i, 1) + load_forces[i, 1]
-        fz = fma(-settings.soft_ground, sunk, load(lanes.f, i, 2) + load_forces[i, 2])
-        store(lanes.f, i, 0, fx)
-        store(lanes.f, i, 1, fy)
-        store(lanes.f, i, 2, fz)
-        fz = select(load1(lanes.held, i) > 0.0, zero, fz)
-        square = dot(fx, fy, fz, fx, fy, fz)
-        worst = select(square > worst, square, worst)
-    store1(lanes.scalars, RESIDUAL, sqrt(worst))
-
-
-@jit(forceinline=False)
 def newton_direction(structure, pattern, settings, lanes):
     """Solve (H + mu I) d = f on the free coordinates; sets PIVOT, SLOPE = f . d and CUT, which keeps d to the trust length."""
-    lattice_tangent(structure, pattern, lanes.actuator_length, lanes.x, lanes.h)
+    lattice_tangent(structure, pattern, lanes.actuator_length, lanes.x, lanes.h, lanes.tension)
     shift = load1(lanes.scalars, SHIFT)
     zero = shift * 0.0
     for i in range(structure.mass.shape[0]):
@@ -137,22 +112,44 @@ def newton_direction(structure, pattern, settings, lanes):
 
 
 @jit(forceinline=False)
-def try_step(structure, settings, gravity, load_forces, lanes):
-    """trial = x + CUT d; sets TRIAL to its energy."""
+def step(structure, settings, lanes):
+    """x += CUT d, and the tensions that the linearised step predicts; nothing where the factor was void."""
     cut = load1(lanes.scalars, CUT)
+    cut = select((load1(lanes.scalars, PIVOT) > 0.0) & (load1(lanes.scalars, SLOPE) >= 0.0), cut, cut * 0.0)
     for i in range(structure.mass.shape[0]):
         for c in range(3):
-            store(lanes.trial, i, c, fma(cut, load(lanes.d, i, c), load(lanes.x, i, c)))
-    store1(lanes.scalars, TRIAL, static_energy(structure, settings, gravity, load_forces, lanes, lanes.trial))
+            store(lanes.d, i, c, select(cut > 0.0, cut * load(lanes.d, i, c), cut * 0.0))
+    axial_tensions(structure, lanes.actuator_length, lanes.x, lanes.d, lanes.tension)
+    for k in range(structure.bars.shape[0] * (structure.bars.shape[1] - 1)):
+        pull = load1(lanes.tension, k)
+        most = splat(-settings.most_compression, pull)
+        store1(lanes.tension, k, select(pull > most, pull, most))
+    for i in range(structure.mass.shape[0]):
+        for c in range(3):
+            store(lanes.x, i, c, load(lanes.x, i, c) + load(lanes.d, i, c))
 
 
 @jit(forceinline=False)
-def take(lanes, lane):
-    """x = trial in one lane."""
+def set_anchor(lanes, lane):
+    """Remember the positions and tensions of a lane."""
     for i in range(lanes.x.shape[0]):
         for c in range(3):
-            lanes.x[i, c, lane] = lanes.trial[i, c, lane]
-    lanes.scalars[ENERGY, lane] = lanes.scalars[TRIAL, lane]
+            lanes.anchor[i, c, lane] = lanes.x[i, c, lane]
+    for k in range(lanes.tension.shape[0]):
+        lanes.anchor_tension[k, lane] = lanes.tension[k, lane]
+    lanes.scalars[ANCHOR, lane] = lanes.scalars[ENERGY, lane]
+    lanes.strayed[lane] = 0
+
+
+@jit(forceinline=False)
+def go_back(lanes, lane):
+    """Return a lane to its anchor."""
+    for i in range(lanes.x.shape[0]):
+        for c in range(3):
+            lanes.x[i, c, lane] = lanes.anchor[i, c, lane]
+    for k in range(lanes.tension.shape[0]):
+        lanes.tension[k, lane] = lanes.anchor_tension[k, lane]
+    lanes.strayed[lane] = 0
 
 
 @jit(forceinline=False)
@@ -216,6 +213,16 @@ def next_stage(structure, settings, lanes, lane, stretches):
 @jit
 def find_equilibria(structure, pattern, gravity, load_forces, settings, stretches, records, lanes, first, last, progress):
     """Equilibria ``first`` to ``last`` of ``records`` for ``stretches`` (n, n_actuators) in one thread's lanes."""
+    statics = Statics(
+        structure,
+        gravity,
+        load_forces,
+        lanes.actuator_length,
+        lanes.still,
+        lanes.memory,
+        lanes.held,
+        settings.soft_ground,
+    )
     count = lanes.x.shape[2]
     case = lanes.case
     queue = first
@@ -229,13 +236,17 @@ def find_equilibria(structure, pattern, gravity, load_forces, settings, stretche
             queue += 1
             running += 1
     while running > 0:
-        free_forces(structure, settings, gravity, load_forces, lanes)
+        evaluate(statics, lanes)
         moved = False
         for lane in range(count):
             if case[lane] < 0:
                 continue
             stage = next_stage(structure, settings, lanes, lane, stretches[case[lane]])
-            moved = moved or stage != ITERATE
+            if stage == ITERATE:
+                moved = _judge(settings, lanes, lane) or moved
+                continue
+            moved = True
+            lanes.strayed[lane] = -1
             if stage == FOUND or stage == GIVEN_UP:
                 _store_case(lanes, lane, records, case[lane], stage == FOUND)
                 progress[0] += 1
@@ -247,13 +258,21 @@ def find_equilibria(structure, pattern, gravity, load_forces, settings, stretche
                     running += 1
                     _load_case(structure, settings, lanes, lane, stretches[case[lane]], records.positions[case[lane]])
         if moved:
-            free_forces(structure, settings, gravity, load_forces, lanes)
-        store1(lanes.scalars, ENERGY, static_energy(structure, settings, gravity, load_forces, lanes, lanes.x))
+            evaluate(statics, lanes)
+            for lane in range(count):
+                if lanes.strayed[lane] < 0:
+                    set_anchor(lanes, lane)
         newton_direction(structure, pattern, settings, lanes)
-        try_step(structure, settings, gravity, load_forces, lanes)
+        step(structure, settings, lanes)
         for lane in range(count):
             lanes.iterations[lane] += 1
-            _judge_step(settings, lanes, lane)
+
+
+@jit(forceinline=False)
+def evaluate(statics, lanes):
+    """Fill f, set RESIDUAL and ENERGY."""
+    store1(lanes.scalars, RESIDUAL, static_forces(statics, lanes.x, lanes.f))
+    store1(lanes.scalars, ENERGY, static_energy(statics, lanes.x))
 
 
 @jit(forceinline=False)
@@ -267,6 +286,9 @@ def _load_case(structure, settings, lanes, lane, stretches, positions):
     lanes.share[lane] = load_increment(stretches, settings) if settings.unload > 0.0 else 1.0
     set_load(structure, lanes, lane, stretches, lanes.share[lane])
     lanes.scalars[SHIFT, lane] = settings.least_shift
+    for k in range(lanes.tension.shape[0]):
+        lanes.tension[k, lane] = 0.0
+    lanes.strayed[lane] = -1
 
 
 @jit(forceinline=False)
@@ -282,27 +304,28 @@ def _store_case(lanes, lane, records, case, found):
 
 
 @jit(forceinline=False)
-def _judge_step(settings, lanes, lane):
-    """Take or refuse the trial of one lane and adapt its shift mu."""
+def _judge(settings, lanes, lane):
+    """Keep a lane's last step, or after ``settings.patience`` steps without a fall of energy go back; adapt its shift mu.
+
+    Returns whether the lane went back.
+    """
     s = lanes.scalars
-    if s[PIVOT, lane] <= 0.0:  # not positive definite: the factor is void
-        s[SHIFT, lane] = max(10.0 * s[SHIFT, lane], 1.0)
-        return
-    cut = s[CUT, lane]
-    predicted = s[SLOPE, lane] * cut * (1.0 - 0.5 * cut)
-    gained = s[ENERGY, lane] - s[TRIAL, lane]
-    noise = 1e-13 * abs(s[ENERGY, lane])
-    if predicted < noise:  # too close for energies to tell
-        take(lanes, lane)
+    if lanes.strayed[lane] < 0:
+        set_anchor(lanes, lane)
+        return False
+    if not (s[PIVOT, lane] > 0.0 and s[SLOPE, lane] >= 0.0):  # not positive definite: no step was taken
+        s[SHIFT, lane] = max(10.0 * s[SHIFT, lane], settings.first_shift)
+        return False
+    if s[ENERGY, lane] <= s[ANCHOR, lane] + 1e-13 * abs(s[ANCHOR, lane]):
+        set_anchor(lanes, lane)
         s[SHIFT, lane] = max(0.1 * s[SHIFT, lane], settings.least_shift)
-        return
-    ratio = gained / predicted
-    if ratio > 1e-3:
-        take(lanes, lane)
-    if ratio > 0.7:
-        s[SHIFT, lane] = max(0.1 * s[SHIFT, lane], settings.least_shift)
-    elif not ratio > 0.2:
-        s[SHIFT, lane] = max(5.0 * s[SHIFT, lane], 1.0)
+        return False
+    lanes.strayed[lane] += 1
+    if lanes.strayed[lane] < settings.patience and s[ENERGY, lane] < 1e300:
+        return False
+    go_back(lanes, lane)
+    s[SHIFT, lane] = max(10.0 * s[SHIFT, lane], settings.first_shift)
+    return True
 
 
 @jit(cache=True)

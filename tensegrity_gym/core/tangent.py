@@ -5,7 +5,7 @@ from __future__ import annotations
 from tensegrity_gym.core.blocks import add, add_block, outer, scaled_identity, subtract, subtract_block, transpose
 from tensegrity_gym.core.forces import between, dot
 from tensegrity_gym.core.jit import jit
-from tensegrity_gym.core.lanes import load, load1, select, splat, sqrt, store
+from tensegrity_gym.core.lanes import load, load1, select, splat, sqrt, store, store1
 from tensegrity_gym.core.members import HINGE_COEFFICIENTS, angle_over_sine
 
 _C = HINGE_COEFFICIENTS
@@ -40,21 +40,19 @@ def add_pair(h, i, j, slot, block):
 
 
 @jit
-def cable_tangent(i, j, slot, stiffness, natural, x, h):
-    """Add one tension-only cable."""
+def cable_tangent(i, j, slot, stiffness, natural, x, h, tensions, row):
+    """Add one tension-only cable; ``tensions``: see :func:`lattice_tangent`."""
     dx, dy, dz = between(x, i, j)
     length = sqrt(dot(dx, dy, dz, dx, dy, dz))
     zero = splat(0.0, length)
     taut = length > natural
     inv = 1.0 / select(taut, length, splat(1.0, length))
-    tension = select(taut, stiffness * (length - natural), zero)
-    add_pair(
-        h,
-        i,
-        j,
-        slot,
-        spring_block(select(taut, splat(1.0, length) * stiffness, zero), tension, inv, (dx * inv, dy * inv, dz * inv)),
-    )
+    if tensions is None:
+        tension = select(taut, stiffness * (length - natural), zero)
+    else:
+        tension = select(taut, load1(tensions, row), zero)
+    n = (dx * inv, dy * inv, dz * inv)
+    add_pair(h, i, j, slot, spring_block(select(taut, splat(1.0, length) * stiffness, zero), tension, inv, n))
 
 
 @jit
@@ -114,10 +112,11 @@ def multiply(a, b):
 
 
 @jit
-def bar_tangent(structure, pattern, b, x, h):
+def bar_tangent(structure, pattern, b, x, h, tensions):
     """Add one bar: its segments' springs and its hinges."""
     bars = structure.bars
-    stiffness, natural = structure.segment_stiffness[b], structure.segment_length[b]
+    stiffness = structure.segment_stiffness[b]
+    row = b * (bars.shape[1] - 1)
     zero = load(x, 0, 0) * 0.0
     previous = (zero, zero, zero)
     inverse_previous = zero
@@ -127,7 +126,11 @@ def bar_tangent(structure, pattern, b, x, h):
         length = sqrt(dot(dx, dy, dz, dx, dy, dz))
         inv = 1.0 / length
         n = (dx * inv, dy * inv, dz * inv)
-        block = spring_block(zero + stiffness, stiffness * (length - natural), inv, n)
+        if tensions is None:
+            tension = stiffness * (length - structure.segment_length[b])
+        else:
+            tension = load1(tensions, row + j)
+        block = spring_block(zero + stiffness, tension, inv, n)
         add_pair(h, near, far, pattern.near_slots[b, j, 0], block)
         if j > 0:
             aa, ab, bb = hinge_blocks(structure.hinge_stiffness[b], previous, inverse_previous, n, inv)
@@ -145,18 +148,57 @@ def bar_tangent(structure, pattern, b, x, h):
 
 
 @jit
-def lattice_tangent(structure, pattern, actuator_length, x, h):
-    """Fill h with the tangent stiffness of all members [N/m], fill slots zero."""
+def lattice_tangent(structure, pattern, actuator_length, x, h, tensions=None):
+    """Fill h with the tangent stiffness of all members [N/m], fill slots zero.
+
+    The geometric stiffness is made with ``tensions`` [N] of the axial members (bar segments, cables, actuated cables) where
+    they are given, as a mixed Newton step needs it (see ``newton.py``); with those at x, the default, it is d2U/dx2.
+    """
     zero = load(x, 0, 0) * 0.0
     for slot in range(h.shape[0]):
         for k in range(9):
             store(h, slot, k, zero)
+    row = structure.bars.shape[0] * (structure.bars.shape[1] - 1)
     for k in range(structure.cables.shape[0]):
         i, j = structure.cables[k, 0], structure.cables[k, 1]
-        cable_tangent(i, j, pattern.cable_slots[k], structure.cable_stiffness[k], structure.cable_length[k], x, h)
+        stiffness, natural = structure.cable_stiffness[k], structure.cable_length[k]
+        cable_tangent(i, j, pattern.cable_slots[k], stiffness, natural, x, h, tensions, row + k)
+    row += structure.cables.shape[0]
     for k in range(structure.actuators.shape[0]):
         natural = load1(actuator_length, k)
         i, j = structure.actuators[k, 0], structure.actuators[k, 1]
-        cable_tangent(i, j, pattern.actuator_slots[k], structure.actuator_rigidity[k] / natural, natural, x, h)
+        cable_tangent(i, j, pattern.actuator_slots[k], structure.actuator_rigidity[k] / natural, natural, x, h, tensions, row + k)
     for b in range(structure.bars.shape[0]):
-        bar_tangent(structure, pattern, b, x, h)
+        bar_tangent(structure, pattern, b, x, h, tensions)
+
+
+@jit
+def _predicted_length(i, j, x, d):
+    """Length of a member after the step d as its linearisation at x has it: l + n . (d_j - d_i)."""
+    dx, dy, dz = between(x, i, j)
+    ex, ey, ez = between(d, i, j)
+    length = sqrt(dot(dx, dy, dz, dx, dy, dz))
+    positive = select(length > 0.0, length, splat(1.0, length))
+    return length + dot(dx, dy, dz, ex, ey, ez) / positive
+
+
+@jit
+def axial_tensions(structure, actuator_length, x, d, tensions):
+    """Tensions [N] of all axial members after the step d, linearised at x: with d = 0 their tensions at x."""
+    segments = structure.bars.shape[1] - 1
+    for b in range(structure.bars.shape[0]):
+        for j in range(segments):
+            length = _predicted_length(structure.bars[b, j], structure.bars[b, j + 1], x, d)
+            store1(tensions, b * segments + j, structure.segment_stiffness[b] * (length - structure.segment_length[b]))
+    row = structure.bars.shape[0] * segments
+    for k in range(structure.cables.shape[0]):
+        length = _predicted_length(structure.cables[k, 0], structure.cables[k, 1], x, d)
+        stretch = length - structure.cable_length[k]
+        store1(tensions, row + k, structure.cable_stiffness[k] * select(stretch > 0.0, stretch, stretch * 0.0))
+    row += structure.cables.shape[0]
+    for k in range(structure.actuators.shape[0]):
+        natural = load1(actuator_length, k)
+        length = _predicted_length(structure.actuators[k, 0], structure.actuators[k, 1], x, d)
+        stretch = length - natural
+        stiffness = structure.actuator_rigidity[k] / natural
+        store1(tensions, row + k, stiffness * select(stretch > 0.0, stretch, stretch * 0.0))

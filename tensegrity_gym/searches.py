@@ -1,0 +1,297 @@
+"""Searches for equilibria: each method's settings, work arrays and threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from tensegrity_gym.batch import Progress, run_shares
+from tensegrity_gym.core.conjugate_gradient import DescentSettings
+from tensegrity_gym.core.descent import DescentRecords, DescentScratch, GroundSettings, descend_equilibria, relax_equilibria
+from tensegrity_gym.core.lanes import lane_count, lanes_empty
+from tensegrity_gym.core.newton import N_SCALARS, EquilibriumRecords, NewtonLanes, NewtonSettings, newton_equilibria
+from tensegrity_gym.core.relaxation import RelaxationSettings
+from tensegrity_gym.design import Design
+from tensegrity_gym.elimination import lattice_pattern
+from tensegrity_gym.lattice import Lattice
+from tensegrity_gym.scene import Scene
+from tensegrity_gym.types import Floats, Structure
+
+#: The load that decides which way a bar bows, over the bar's Euler load: downwards, as a bar's own weight does on Earth.
+IMPERFECTION = 1e-5
+#: Residual force per mass at which Newton's equilibria count as found, over the Euler load of a bar.
+TOLERANCE = 1e-8
+#: Fictitious masses of relaxation over the sum of the stiffnesses at them; 1/2 is the limit of linear stability.
+MASS_MARGIN = 0.55
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How hard a method tries; what is None is the method's default."""
+
+    tolerance: float | None = None
+    """Residual force per mass at which an equilibrium counts as found, over a bar's Euler load [-]: 1e-8 for Newton, whose
+    last step is quadratic; 2e-6 for relaxation; 1e-5 for conjugate gradients, whose energies cannot tell more."""
+    max_iterations: int | None = None
+    """Factorisations (2000), directions (200 000) or steps (2 000 000) that one lattice may take."""
+    load_step: float = 0.1
+    """Newton: largest change of a stretch in one step along the load path [-]."""
+    line_tolerance: float = 0.1
+    """Conjugate gradients: change of the best step, over it, at which a line search ends [-]."""
+    line_cap: int = 10
+    """Conjugate gradients: parabolas per line search."""
+    damping: str = "viscous"
+    """Relaxation: "viscous" or "kinetic"."""
+
+
+class Problem(NamedTuple):
+    """Equilibria to find."""
+
+    stretches: Floats  #: lambda [-], shape (n, n_actuators)
+    start: Floats | None  #: positions to start from at full load [m], shape (n, n_masses, 3); None for the unloaded lattice
+    design: Design  #: materials and sizes
+    scene: Scene  #: gravity
+    lattice: Lattice  #: topology
+    structure: Structure  #: the lattice built to the design
+
+    @property
+    def normal_gravity(self) -> Floats:
+        """Gravity along the ground's normal [m/s^2], shape (3,): friction holds the rest until the release."""
+        return np.array((0.0, 0.0, self.scene.gravity_vector[2]))
+
+    @property
+    def soft_ground(self) -> float:
+        """Stiffness [N/m] of the ground on the way: the whole weight on one mass sinks it by 0.001 of the cell's height."""
+        return float(self.structure.mass.sum() * -self.normal_gravity[2] / (1e-3 * self.design.cell_height))
+
+    def start_positions(self) -> Floats:
+        """Where the search starts [m], shape (n, n_masses, 3), a fresh array."""
+        if self.start is not None:
+            return np.array(self.start, dtype=np.float64, order="C")
+        return np.repeat(start_positions(self.design, self.lattice)[None], len(self.stretches), axis=0)
+
+
+class Found(NamedTuple):
+    """What a search found."""
+
+    positions: Floats  #: [m], shape (n, n_masses, 3)
+    forces: Floats  #: of members and weight [N], shape (n, n_masses, 3)
+    residual: Floats  #: largest unbalanced force on a mass [N], shape (n,)
+    iterations: np.ndarray  #: shape (n,)
+    evaluations: np.ndarray  #: of the energy or the forces, shape (n,)
+    converged: np.ndarray  #: shape (n,)
+    tolerance: float  #: [N]
+    max_iterations: int  #: cap
+
+
+def start_positions(design: Design, lattice: Lattice, bow: float = 1e-3) -> Floats:
+    """The unloaded lattice standing on the ground, its bars bowed downwards by ``bow`` of their length, (n_masses, 3) [m]."""
+    x = design.unloaded_positions(lattice)
+    x[:, 2] -= x[:, 2].min()
+    structure = design.structure(lattice)
+    axis = x[structure.bars[:, -1]] - x[structure.bars[:, 0]]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    down = np.array((0.0, 0.0, -1.0)) + axis[:, 2:] * axis
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    x[structure.bars[:, 1:-1]] += bow * design.bar_length * down[:, None, :]
+    x[x[:, 2] < 1e-9, 2] = 0.0
+    return x
+
+
+def imperfection_forces(design: Design, structure: Structure) -> Floats:
+    """Self-balanced dead load that bows each bar downwards, shape (n_masses, 3) [N].
+
+    Without gravity the bow of a pin-ended bar may point anywhere around its chord; this settles it and, pointing down,
+    keeps every symmetry of the lattice on the ground.
+    """
+    forces = np.zeros((len(structure.mass), 3))
+    inner = structure.bars[:, 1:-1]
+    if inner.shape[1]:
+        load = IMPERFECTION * design.critical_load
+        forces[inner.ravel(), 2] -= load
+        for end in (0, -1):
+            np.add.at(forces[:, 2], structure.bars[:, end], load * inner.shape[1] / 2)
+    return forces
+
+
+def newton_search(problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None) -> Found:
+    """Newton along the load path, or from given positions; 8 lattices at a time in each thread's lanes."""
+    design, structure = problem.design, problem.structure
+    n, m = len(problem.stretches), len(structure.mass)
+    pattern = lattice_pattern(problem.lattice, int(design.bar_segments))
+    dead_load = imperfection_forces(design, structure)
+    gravity = problem.normal_gravity
+    settings = NewtonSettings(
+        load_step=options.load_step,
+        path_tolerance=0.02 * design.critical_load,
+        tolerance=(options.tolerance or TOLERANCE) * design.critical_load,
+        max_iterations=options.max_iterations or 2000,
+        longest_step=0.05 * design.cell_height,
+        least_shift=1e-4 * design.critical_load / design.bar_length,
+        unload=1.0 if problem.start is None else 0.0,
+        soft_ground=problem.soft_ground,
+        most_compression=1.2 * design.critical_load,
+        patience=12,
+        first_shift=0.01 * design.critical_load / design.bar_length,
+        max_rounds=100,
+    )
+    records = EquilibriumRecords(
+        positions=problem.start_positions(),
+        forces=np.zeros((n, m, 3)),
+        residual=np.zeros(n),
+        iterations=np.zeros(n, dtype=np.int64),
+        converged=np.zeros(n, dtype=np.bool_),
+        least_pivot=np.zeros(n),
+    )
+
+    def work(first: int, last: int, counter: np.ndarray) -> None:
+        lanes = newton_lanes(structure, pattern.n_slots)
+        newton_equilibria(
+            structure, pattern, gravity, dead_load, settings, problem.stretches, records, lanes, first, last, counter
+        )
+
+    run_shares(work, n, threads, lane_count(np.float64), progress)
+    return Found(
+        records.positions,
+        records.forces,
+        records.residual,
+        records.iterations,
+        records.iterations,
+        records.converged,
+        settings.tolerance,
+        settings.max_iterations,
+    )
+
+
+def newton_lanes(structure: Structure, n_slots: int) -> NewtonLanes:
+    """Work arrays of one thread."""
+    count, n_masses = lane_count(np.float64), len(structure.mass)
+    members = structure.n_axial_members
+    return NewtonLanes(
+        x=lanes_empty((n_masses, 3)),
+        anchor=lanes_empty((n_masses, 3)),
+        still=lanes_empty((n_masses, 3)),
+        f=lanes_empty((n_masses, 3)),
+        memory=lanes_empty((members,)),
+        d=lanes_empty((n_masses, 3)),
+        h=lanes_empty((n_slots, 9)),
+        actuator_length=lanes_empty((len(structure.actuators),)),
+        scalars=lanes_empty((N_SCALARS,)),
+        case=np.zeros(count, dtype=np.int64),
+        iterations=np.zeros(count, dtype=np.int64),
+        share=np.zeros(count),
+        rounds=np.zeros(count, dtype=np.int64),
+        tension=lanes_empty((members,)),
+        anchor_tension=lanes_empty((members,)),
+        strayed=np.zeros(count, dtype=np.int64),
+        held=lanes_empty((n_masses,)),
+    )
+
+
+def cg_search(problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None) -> Found:
+    """The paper's conjugate gradients from the unloaded lattice, one lattice after another in each thread."""
+    structure, design = problem.structure, problem.design
+    settings = DescentSettings(
+        tolerance=(options.tolerance or 1e-5) * design.critical_load,
+        max_iterations=options.max_iterations or 200_000,
+        line_tolerance=options.line_tolerance,
+        line_cap=options.line_cap,
+        longest_step=0.05 * design.cell_height,
+        sufficient=0.1,
+    )
+    ground, dead_load, gravity = _ground(problem), imperfection_forces(design, structure), problem.normal_gravity
+    records = _descent_records(problem)
+
+    def work(first: int, last: int, counter: np.ndarray) -> None:
+        scratch = descent_scratch(structure)
+        descend_equilibria(
+            structure, gravity, dead_load, ground, settings, problem.stretches, records, scratch, first, last, counter
+        )
+
+    run_shares(work, len(problem.stretches), threads, 1, progress)
+    return Found(*records, settings.tolerance, settings.max_iterations)
+
+
+def relaxation_search(problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None) -> Found:
+    """Dynamic relaxation from the unloaded lattice, one lattice after another in each thread."""
+    structure, design = problem.structure, problem.design
+    settings = RelaxationSettings(
+        tolerance=(options.tolerance or 2e-6) * design.critical_load,
+        max_iterations=options.max_iterations or 2_000_000,
+        kinetic=options.damping == "kinetic",
+        softest=1e-4,
+        longest_step=0.05 * design.cell_height,
+    )
+    ground, dead_load, gravity = _ground(problem), imperfection_forces(design, structure), problem.normal_gravity
+    mass = fictitious_masses(structure, problem.stretches, ground.soft_ground)
+    records = _descent_records(problem)
+
+    def work(first: int, last: int, counter: np.ndarray) -> None:
+        scratch = descent_scratch(structure)
+        relax_equilibria(
+            structure, gravity, dead_load, ground, settings, problem.stretches, mass, records, scratch, first, last, counter
+        )
+
+    run_shares(work, len(problem.stretches), threads, 1, progress)
+    return Found(*records, settings.tolerance, settings.max_iterations)
+
+
+def fictitious_masses(structure: Structure, stretches: Floats, soft_ground: float) -> Floats:
+    """Masses [N step^2/m] for which dynamic relaxation with unit step is stable, shape (n, n_masses).
+
+    (a - b)^2 <= 2 a^2 + 2 b^2 bounds the stiffness by twice the sum of the members' at each mass, and stability asks for a
+    quarter of that; ``MASS_MARGIN`` is more than 1/2 for geometric stiffness.
+    """
+    mass = np.full((len(structure.mass), len(stretches)), 0.25 * soft_ground)
+    actuators = structure.actuator_rigidity / (stretches * structure.actuator_length)
+    for end in (0, 1):
+        np.add.at(mass, structure.cables[:, end], MASS_MARGIN * structure.cable_stiffness[:, None])
+        np.add.at(mass, structure.actuators[:, end], MASS_MARGIN * actuators.T)
+    segments = structure.bars.shape[1] - 1
+    for k in range(segments):
+        for end in (0, 1):
+            np.add.at(mass, structure.bars[:, k + end], MASS_MARGIN * structure.segment_stiffness[:, None])
+    bending = structure.hinge_stiffness / structure.segment_length**2
+    for k in range(segments - 1):
+        for offset, share in enumerate((1.1, 2.2, 1.1)):
+            np.add.at(mass, structure.bars[:, k + offset], share * bending[:, None])
+    return np.ascontiguousarray(mass.T)
+
+
+def descent_scratch(structure: Structure) -> DescentScratch:
+    """Work arrays of one thread."""
+    shape = (len(structure.mass), 3)
+    return DescentScratch(
+        f=np.zeros(shape),
+        old=np.zeros(shape),
+        d=np.zeros(shape),
+        trial=np.zeros(shape),
+        still=np.zeros(shape),
+        memory=np.zeros(structure.n_axial_members),
+        held=np.zeros(shape[0]),
+        actuator_length=np.zeros(len(structure.actuators)),
+    )
+
+
+def _ground(problem: Problem) -> GroundSettings:
+    return GroundSettings(soft_ground=problem.soft_ground, release=1e-6 * problem.design.critical_load, max_rounds=100)
+
+
+def _descent_records(problem: Problem) -> DescentRecords:
+    n, m = len(problem.stretches), len(problem.structure.mass)
+    return DescentRecords(
+        positions=problem.start_positions(),
+        forces=np.zeros((n, m, 3)),
+        residual=np.zeros(n),
+        iterations=np.zeros(n, dtype=np.int64),
+        evaluations=np.zeros(n, dtype=np.int64),
+        converged=np.zeros(n, dtype=np.bool_),
+    )
+
+
+Search = Callable[[Problem, SearchOptions, "int | None", "Progress | None"], Found]
+#: Methods of form-finding by name.
+SEARCHES: dict[str, Search] = {"newton": newton_search, "cg": cg_search, "relaxation": relaxation_search}
