@@ -1,0 +1,277 @@
+"""Whether a hop file is what was written, is of the schema, and obeys physics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import h5py
+import numpy as np
+import tyro
+
+from surrogate import dataset
+from surrogate.hops import Configuration, HopData, split_share
+from surrogate.schema import SCHEMA_VERSION, columns_of
+from tensegrity_gym import ENERGY_NAMES, STRETCH_RANGE, Design, HopStatus, Lattice, Scene
+from tensegrity_gym.errors import DataFileError
+
+#: Largest departure of the energies' sum from constant, over the stored energy. Default steps close to 3e-4 in float64 and
+#: 5e-3 in float32, 48 hops, Earth; twice that may pass at twice the step.
+CLOSURE = {"float64": 2e-3, "float32": 2e-2}
+#: Largest disagreement of heights that energies and flight imply [m]: a step's fall at touchdown speed, and rounding.
+HEIGHT = {"float64": 3e-4, "float32": 1e-3}
+TAKEOFF, TOUCHDOWN, END = 1, 2, 3
+KINETIC, GRAVITATIONAL = ENERGY_NAMES.index("kinetic"), ENERGY_NAMES.index("gravitational")
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """Verify seal, schema, checksums and physics of files of hops."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Files to check."""
+
+
+def check(path: Path | str) -> list[str]:
+    """All that is wrong with a file, one line each; none for a good file."""
+    path = Path(path)
+    if not path.is_file():
+        return [f"expected a data file at {path}, found none"]
+    problems = []
+    with open(path, "rb") as raw:
+        if raw.read(dataset.SEAL_BYTES) != dataset.seal_of(path):
+            problems.append("seal: the file's bytes are not those that were written (flipped, cut off, or changed since)")
+    try:
+        data = dataset.read(path, content=None)
+        with h5py.File(path, "r") as file:
+            problems += _attributes(file, data)
+    except DataFileError as error:
+        return [*problems, str(error)]
+    return problems + [f"{what}: {count} rows, first at {row}" for what, count, row in violations(data)]
+
+
+def _attributes(file: h5py.File, data: HopData) -> Iterator[str]:
+    schema = columns_of(data.configuration)
+    extra = sorted(set(file) - set(schema) - {dataset.CHECKSUMS})
+    if extra:
+        yield f"columns: expected {list(schema)}, got {extra} beside them"
+    for name, column in schema.items():
+        for what, wanted in (("unit", column.unit), ("description", column.description)):
+            if file[name].attrs.get(what) != wanted:
+                yield f"column {name}: expected {what} {wanted!r}, got {file[name].attrs.get(what)!r}"
+    fields: tuple[tuple[str, Any], ...] = (
+        ("hops", len(data)),
+        ("schema_version", SCHEMA_VERSION),
+        ("model_version", data.configuration["model_version"]),
+        ("precision", data.configuration["precision"]),
+        ("seed", data.configuration["seed"]),
+    )
+    for what, value in fields:
+        if file.attrs.get(what) != value:
+            yield f"attribute {what}: expected {value!r}, got {file.attrs.get(what)!r}"
+    for what in ("command", "date", "packages", "skipped", "design", "scene"):
+        if what not in file.attrs:
+            yield f"attribute {what}: missing"
+
+
+def violations(data: HopData) -> list[tuple[str, int, int]]:
+    """Invariants that rows break: which, how many rows, and the first of them."""
+    rules = [*_COMMON, *(_HOP_RULES if data.configuration["content"] == "hops" else ())]
+    found = []
+    for what, rule in rules:
+        with np.errstate(all="ignore"):
+            bad = np.flatnonzero(~rule(data))
+        if len(bad):
+            found.append((what, len(bad), int(bad[0])))
+    return found
+
+
+Rule = Callable[[HopData], np.ndarray]
+
+
+def _finite(data: HopData) -> np.ndarray:
+    return np.logical_and.reduce([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in data.columns.values()])
+
+
+def _ascending(data: HopData) -> np.ndarray:
+    key = data["index"] * 64 + data["image"]
+    return np.concatenate([[True] * min(1, len(key)), np.diff(key) > 0])
+
+
+def _in_range(data: HopData) -> np.ndarray:
+    low, high = STRETCH_RANGE
+    return ((data["stretches"] >= low) & (data["stretches"] <= high)).all(axis=1)  # type: ignore[return-value]
+
+
+def _own_share(data: HopData) -> np.ndarray:
+    return data["split_share"] == split_share(data["stretches"], Lattice(**data.configuration["lattice"]))
+
+
+def _image_number(data: HopData) -> np.ndarray:
+    images = _configuration(data).rows_per_hop
+    return (data["image"] >= 0) & (data["image"] < images)
+
+
+def _scene_values(data: HopData) -> np.ndarray:
+    good = np.ones(len(data), dtype=bool)
+    for name, (low, high) in data.configuration["scene_ranges"].items():
+        good &= (data[f"scene_{name}"] >= low) & (data[f"scene_{name}"] <= high)
+    return good
+
+
+def _counts(data: HopData) -> np.ndarray:
+    good = (data["index"] >= 0) & (data["iterations"] >= 0) & (data["cpu_seconds"] >= 0) & (data["residual"] >= 0)
+    return good & (data["stored_energy"] >= 0)
+
+
+def _balanced(data: HopData) -> np.ndarray:
+    # a micronewton against members that carry tens of newtons
+    return (data["residual"] < 1e-5 * Design(**data.configuration["design"]).critical_load) | ~_settled(data)
+
+
+def _settled(data: HopData) -> np.ndarray:
+    return data["converged"] == 1 if "converged" in data.columns else data["status"] != HopStatus.NOT_CONVERGED
+
+
+def _status(data: HopData) -> np.ndarray:
+    return np.isin(data["status"], [int(s) for s in HopStatus])
+
+
+def _flew(data: HopData) -> np.ndarray:
+    return data["status"] <= HopStatus.TIME_LIMIT
+
+
+def _times(data: HopData) -> np.ndarray:
+    limit = data.configuration["scene"]["duration"] * 1.01 + 2e-3  # whole strides of steps
+    a, b, c = data["takeoff_time"], data["touchdown_time"], data["end_time"]
+    order = (a >= 0) & (b >= a) & (c >= b - 1e-9)
+    moved = (data["status"] == HopStatus.NOT_CONVERGED) | ((data["steps"] > 0) & (c > 0))
+    return (order | ~_flew(data)) & (c <= limit) & (c >= 0) & moved
+
+
+def _flight_time(data: HopData) -> np.ndarray:
+    expected = np.where(_flew(data), data["touchdown_time"] - data["takeoff_time"], 0.0)
+    return np.abs(data["flight_time"] - expected) < 1e-9
+
+
+def _steps(data: HopData) -> np.ndarray:
+    """All hops of a file take one step, so steps and time are proportional."""
+    going = (data["steps"] > 0) & data.usable
+    if not going.any():
+        return np.ones(len(data), dtype=bool)
+    dt = np.median(data["end_time"][going] / data["steps"][going])
+    return ~going | (np.abs(data["end_time"] / dt - data["steps"]) < 1.0 + 1e-5 * data["steps"])
+
+
+def _landing(data: HopData) -> np.ndarray:
+    return (data["landing"] == data[data.configuration["scene"]["landing"]]).all(axis=1)
+
+
+def _nodes_near(data: HopData) -> np.ndarray:
+    """The mean of the nodes and the centre of mass lie in the same lattice."""
+    lattice = Lattice(**data.configuration["lattice"])
+    size = Design(**data.configuration["design"]).cell_height * max(lattice.nx, lattice.ny)
+    near = [np.linalg.norm(data[k] - data[f"{k}_nodes"], axis=1) < 0.5 * size for k in ("rest", "touchdown")]
+    return near[0] & near[1]
+
+
+def _closure(data: HopData) -> np.ndarray:
+    total = data["energies"].sum(axis=2)
+    reached = np.ones(total.shape, dtype=bool)
+    reached[:, (TAKEOFF, TOUCHDOWN)] = _flew(data)[:, None]  # events that a hop without flight never had
+    drift = np.where(reached, np.abs(total - total[:, :1]), 0.0).max(axis=1)
+    return (drift < CLOSURE[data.configuration["precision"]] * data["stored_energy"]) | ~data.usable
+
+
+def _dissipation(data: HopData) -> np.ndarray:
+    lost = data["energies"][:, :, 5:]
+    first = (lost[:, 0] == 0).all(axis=1)
+    slack = 1e-5 * data["stored_energy"][:, None]
+    later = (lost[:, END] >= -slack).all(axis=1)
+    growing = (np.diff(lost, axis=1) >= -slack[:, None]).all(axis=(1, 2))
+    return (first & later & (growing | ~_flew(data))) | ~data.usable
+
+
+def _kinetic(data: HopData) -> np.ndarray:
+    moving = 0.5 * _mass(data) * (data["takeoff_velocity"] ** 2).sum(axis=1)
+    kinetic = data["energies"][:, :, KINETIC]
+    still = kinetic[:, 0] <= 1e-3 * data["stored_energy"]
+    return (still & (kinetic >= 0).all(axis=1) & (kinetic[:, TAKEOFF] >= moving * (1 - 1e-4))) | ~_flew(data)
+
+
+def _ballistic(data: HopData) -> np.ndarray:
+    """Momentum: between take-off and touchdown the centre of mass falls freely, and its height says so in the energies."""
+    gravity, flat = _gravity(data)
+    weight, height = _mass(data) * gravity, HEIGHT[data.configuration["precision"]]
+    potential = data["energies"][:, :, GRAVITATIONAL]
+    rise = (potential[:, TAKEOFF] - potential[:, 0]) / weight
+    fall = (potential[:, TOUCHDOWN] - potential[:, TAKEOFF]) / weight
+    vz, time = data["takeoff_velocity"][:, 2], data["flight_time"]
+    apex = np.abs(data["apex"] - rise - vz**2 / (2 * gravity)) < height
+    path = np.abs(fall - vz * time + gravity * time**2 / 2) < height
+    return (apex & path) | ~_flew(data) | ~flat
+
+
+def _failed_landings(data: HopData) -> np.ndarray:
+    """What blew up or never started reads zero."""
+    none = [np.all(data[k] == 0, axis=1) for k in ("landing", "takeoff_velocity")]
+    return data.usable | (none[0] & none[1])
+
+
+def _gravity(data: HopData) -> tuple[np.ndarray, np.ndarray]:
+    """Gravity of each hop [m/s^2], and whether its ground is level, where heights alone make potential energy."""
+    scene = data.configuration["scene"]
+    value = {k: data.columns.get(f"scene_{k}", np.full(len(data), scene[k])) for k in ("gravity", "slope")}
+    return value["gravity"], value["slope"] == 0
+
+
+def _mass(data: HopData) -> float:
+    design, lattice = Design(**data.configuration["design"]), Lattice(**data.configuration["lattice"])
+    return float(design.structure(lattice).mass.sum())
+
+
+def _configuration(data: HopData) -> Configuration:
+    plain = {k: v for k, v in data.configuration.items() if k not in ("schema_version", "model_version")}
+    made = {k: kind(**plain[k]) for k, kind in (("design", Design), ("scene", Scene), ("lattice", Lattice))}
+    return Configuration(**(plain | made))
+
+
+_COMMON: tuple[tuple[str, Rule], ...] = (
+    ("values: not finite", _finite),
+    ("index: not ascending, or doubled", _ascending),
+    ("image: not one of the lattice's symmetries", _image_number),
+    ("stretches: out of range", _in_range),
+    ("split_share: not that of the stretches", _own_share),
+    ("scene values: out of their ranges", _scene_values),
+    ("counts, times or stored energy: negative", _counts),
+    ("residual: not that of an equilibrium", _balanced),
+)
+_HOP_RULES: tuple[tuple[str, Rule], ...] = (
+    ("status: not a HopStatus", _status),
+    ("times: out of order, or past the duration", _times),
+    ("flight_time: not touchdown_time - takeoff_time", _flight_time),
+    ("steps: not end_time over the time step", _steps),
+    ("landing: not the column that scene.landing says", _landing),
+    ("nodes: their mean is out of the lattice", _nodes_near),
+    ("failed hops: a landing or speed where there is none", _failed_landings),
+    ("energies: their sum is not constant", _closure),
+    ("energies: dissipation undone", _dissipation),
+    ("energies: kinetic energy below that of the centre of mass", _kinetic),
+    ("momentum: no free flight between take-off and touchdown", _ballistic),
+)
+
+
+def main(config: CheckConfig) -> None:
+    """Entry of ``python -m surrogate check``; DataFileError if anything is wrong."""
+    wrong: dict[str, Any] = {}
+    for path in config.files:
+        problems = check(path)
+        print(f"{path}: {'good' if not problems else f'{len(problems)} problems'}")
+        for problem in problems:
+            print(f"  {problem}")
+        if problems:
+            wrong[str(path)] = problems
+    if wrong:
+        raise DataFileError(f"expected good files, got problems in {', '.join(wrong)}; generate them again")

@@ -1,0 +1,166 @@
+"""Pictures of a file of hops."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from surrogate.hops import HopData
+from surrogate.schema import EVENTS
+from surrogate.storage import atomic_path
+from tensegrity_gym import ENERGY_NAMES, STRETCH_RANGE, HopStatus
+from tensegrity_gym.errors import MissingExtraError
+from tensegrity_gym.types import Floats
+
+try:
+    import matplotlib
+
+    matplotlib.use("Agg")  # no window
+    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
+except ImportError as missing:
+    raise MissingExtraError(
+        "report: expected matplotlib to be installed, it is not; pip install 'tensegrity-gym[learn]'"
+    ) from missing
+
+STYLE = {
+    "font.size": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "legend.frameon": False,
+    "figure.dpi": 130,
+}
+# colours that people with any colour vision tell apart (Okabe and Ito)
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#000000")
+#: Equal sectors of the compass that reach is measured in; eight of them centre on the lattice's axes and diagonals.
+SECTORS = 24
+
+
+def alternating(stretches: Floats) -> Floats:
+    """lambda1 - lambda2 + lambda3 - lambda4 [-], shape (n,)."""
+    return stretches @ np.array([(-1.0) ** k for k in range(stretches.shape[1])])
+
+
+def reach_by_direction(landing: Floats, sectors: int = SECTORS) -> tuple[Floats, Floats, Floats]:
+    """Middle of each sector [rad], and the 95th percentile and the largest landing distance in it [m], shape (sectors,).
+
+    Sectors without landings read 0.
+    """
+    angle, distance = np.arctan2(landing[:, 1], landing[:, 0]), np.hypot(*landing.T)
+    width = 2 * np.pi / sectors
+    number = np.round(angle / width).astype(int) % sectors
+    inside = [distance[number == k] for k in range(sectors)]
+    high = np.array([np.percentile(d, 95) if len(d) else 0.0 for d in inside])
+    top = np.array([d.max() if len(d) else 0.0 for d in inside])
+    return np.arange(sectors) * width, high, top
+
+
+def landing_map(data: HopData) -> Figure:
+    """Rest and touchdown, coloured by the alternating sum of the stretches (the paper's figure)."""
+    colour = alternating(data["stretches"])
+    figure, axes = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
+    size = float(np.clip(4e4 / max(len(data), 1), 3, 26))
+    for axis, name in zip(axes, ("rest", "touchdown"), strict=True):
+        dots = axis.scatter(*data[name].T, c=colour, cmap="coolwarm", vmin=-1.2, vmax=1.2, s=size, linewidths=0)
+        axis.plot(0, 0, "+", color="black", ms=10)
+        side = 1.05 * float(np.abs(data[name]).max() or 1.0)
+        axis.set(xlabel="x [m]", ylabel="y [m]", title=f"{name} of {len(data)} hops", aspect="equal")
+        axis.set(xlim=(-side, side), ylim=(-side, side))
+    figure.colorbar(dots, ax=axes, label="λ1 − λ2 + λ3 − λ4 [-]")
+    return figure
+
+
+def reach(data: HopData) -> Figure:
+    """How far hops go in each direction."""
+    figure, axes = plt.subplots(1, 2, figsize=(11, 5), subplot_kw={"projection": "polar"}, layout="constrained")
+    for axis, name in zip(axes, ("rest", "touchdown"), strict=True):
+        middle, high, top = reach_by_direction(data[name])
+        around = np.append(middle, middle[0] + 2 * np.pi)
+        axis.fill(around, np.append(high, high[0]), color=COLOURS[0], alpha=0.25, label="95 % of hops")
+        axis.plot(around, np.append(high, high[0]), color=COLOURS[0], lw=1.5)
+        axis.plot(around, np.append(top, top[0]), color=COLOURS[5], lw=1.5, label="farthest hop")
+        axis.set_title(f"{name}: distance [m] by direction")
+        axis.set_rlabel_position(22.5)
+    axes[1].legend(loc="lower left", bbox_to_anchor=(0.9, 0.9))
+    return figure
+
+
+def apex(data: HopData) -> Figure:
+    """Apex against the mean stretch."""
+    figure, axis = plt.subplots(figsize=(7, 4.6), layout="constrained")
+    size = float(np.clip(4e4 / max(len(data), 1), 3, 26))
+    spread = np.ptp(data["stretches"], axis=1)
+    dots = axis.scatter(data["stretches"].mean(axis=1), data["apex"], c=spread, s=size, cmap="viridis", linewidths=0)
+    axis.set(xlabel="mean stretch λ [-]", ylabel="apex: rise of the centre of mass [m]")
+    figure.colorbar(dots, ax=axis, label="largest − least λ of the hop [-]")
+    return figure
+
+
+def energies(data: HopData) -> Figure:
+    """Where the stored energy is at each event, mean over hops that flew."""
+    flew = data.rows(data["status"] <= HopStatus.TIME_LIMIT)
+    share = flew["energies"] / flew["stored_energy"][:, None, None]
+    # gravitational energy counts from the start of the hop
+    lift = ENERGY_NAMES.index("gravitational")
+    share[:, :, lift] -= share[:, :1, lift].copy()
+    mean = 100 * share.mean(axis=0) if len(flew) else np.zeros((len(EVENTS), len(ENERGY_NAMES)))
+    figure, axis = plt.subplots(figsize=(9, 4.6), layout="constrained")
+    bottom = np.zeros(len(EVENTS))
+    for k, name in enumerate(ENERGY_NAMES):
+        label = name.replace("dissipated_", "dissipated by ")
+        axis.bar(EVENTS, mean[:, k], 0.6, bottom=bottom, color=COLOURS[k], label=f"elastic, {label}" if k < 3 else label)
+        bottom += np.maximum(mean[:, k], 0.0)
+    axis.set(ylabel="share of the stored energy [%]")
+    axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return figure
+
+
+def outcomes(data: HopData) -> Figure:
+    """How hops end, by mean stretch."""
+    edges = np.linspace(*STRETCH_RANGE, 13)
+    mean = data["stretches"].mean(axis=1)
+    total = np.maximum(np.histogram(mean, edges)[0], 1)
+    figure, axis = plt.subplots(figsize=(9, 4.2), layout="constrained")
+    bottom = np.zeros(len(edges) - 1)
+    for k, status in enumerate(HopStatus):
+        count = np.histogram(mean[data["status"] == status], edges)[0]
+        label = f"{status.name.lower().replace('_', ' ')}: {int((data['status'] == status).sum())}"
+        axis.bar(edges[:-1], 100 * count / total, np.diff(edges), bottom, align="edge", color=COLOURS[k], label=label)
+        bottom += 100 * count / total
+    axis.set(xlabel="mean stretch λ [-]", ylabel="share of hops [%]")
+    axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return figure
+
+
+#: Pictures of a report, in their order, with what each shows.
+PICTURES: dict[str, tuple[Callable[[HopData], Figure], str]] = {
+    "landing_map.png": (
+        landing_map,
+        "Where hops came to rest and where they first touched down, coloured by λ1 − λ2 + λ3 − λ4 (the paper's figure).",
+    ),
+    "reach.png": (reach, "How far hops go in each direction."),
+    "apex.png": (apex, "Apex against the mean stretch, coloured by how unequal the four stretches are."),
+    "energies.png": (
+        energies,
+        "Where the stored energy is at release, take-off, touchdown and end: mean over the hops that flew; gravitational "
+        "energy counts from the start.",
+    ),
+    "outcomes.png": (outcomes, "How hops end, by mean stretch."),
+}
+
+
+def save(draw: Callable[[HopData], Figure], data: HopData, path: Path) -> Path:
+    """Draw a picture into a PNG."""
+    with plt.rc_context(STYLE):  # type: ignore[arg-type]
+        figure = draw(data)
+        picture = io.BytesIO()
+        figure.savefig(picture, format="png", bbox_inches="tight")
+        plt.close(figure)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(picture.getvalue())
+    return path

@@ -1,0 +1,154 @@
+"""A page about a file of hops: landing map, reach, apex, energies, failures, and how far any of it can be trusted."""
+
+from __future__ import annotations
+
+import base64
+import html
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from surrogate import dataset
+from surrogate.hops import HopData
+from surrogate.storage import atomic_path, ensure_folder
+from tensegrity_gym import ENERGY_NAMES, Design, HopStatus, Lattice, Scene, form_find, simulate
+from tensegrity_gym.errors import DataFileError
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
+table { border-collapse: collapse; margin: 1em 0; font-size: 14px; }
+th, td { padding: .35em .8em; border-bottom: 1px solid #ddd; text-align: left; vertical-align: top; word-break: break-word; }
+img { max-width: 100%; height: auto; border: 1px solid #eee; }
+figure { margin: 2em 0; } figcaption { color: #555; font-size: 14px; }
+"""
+#: How far the start of a hop is moved to see how far its landing moves [m]; less than any builder can tell.
+PERTURBATION = 1e-5
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Write a page and pictures about a file of hops."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """File of hops."""
+    out: Path | None = None
+    """Folder of the report; None: beside the file, NAME.report."""
+    floor: int = 0
+    """Measure the floor with so many of the hops, started 10 um off: what no model of the landing can do better than."""
+
+
+def findings(data: HopData) -> dict[str, str]:
+    """What the hops say, in words and numbers."""
+    from surrogate import figures
+
+    usable = data.rows(data.usable)
+    said = {"hops": f"{len(data)}, {len(data) - len(usable)} failed"}
+    for status in HopStatus:
+        said[f"status {status.name}"] = str(int((data["status"] == status).sum()))
+    colour = figures.alternating(usable["stretches"])
+    for name in ("rest", "touchdown"):
+        distance = np.hypot(*usable[name].T)
+        low, middle, high = np.percentile(distance, (5, 50, 95))
+        said[f"{name}: distance"] = f"median {middle:.3f} m, 5 % {low:.3f}, 95 % {high:.3f}, farthest {distance.max():.3f} m"
+        angle, reach, _ = figures.reach_by_direction(usable[name])
+        order = np.argsort(reach)[::-1][:4]
+        said[f"{name}: farthest directions"] = (
+            ", ".join(f"{np.degrees(angle[k]):.0f}° ({reach[k]:.3f} m)" for k in order)
+            + f" by the 95th percentile in sectors of {360 / len(angle):.0f}°; nearest {np.degrees(angle[reach.argmin()]):.0f}° "
+            f"({reach.min():.3f} m)"
+        )
+        axes = reach[:: len(angle) // 4].mean()
+        diagonals = reach[len(angle) // 8 :: len(angle) // 4].mean()
+        said[f"{name}: axes against diagonals"] = (
+            f"{axes:.3f} m at 0/90/180/270°, which the paper finds farthest, {diagonals:.3f} m at 45/135/225/315°"
+        )
+        along = [np.corrcoef(colour, usable[name][:, k])[0, 1] for k in (0, 1)]
+        said[f"{name}: correlation with λ1 − λ2 + λ3 − λ4"] = (
+            f"x {along[0]:+.2f}, y {along[1]:+.2f}, distance {np.corrcoef(np.abs(colour), distance)[0, 1]:+.2f} (with its size)"
+        )
+    mean = usable["stretches"].mean(axis=1)
+    slope, _ = np.polyfit(mean, usable["apex"], 1)
+    said["apex"] = (
+        f"median {np.median(usable['apex']):.3f} m, highest {usable['apex'].max():.3f} m, {slope:+.2f} m per unit of mean "
+        f"stretch, correlation {np.corrcoef(mean, usable['apex'])[0, 1]:+.3f}"
+    )
+    total = usable["energies"].sum(axis=2)
+    flew = usable["status"] <= HopStatus.TIME_LIMIT
+    drift = 100 * np.abs(total - total[:, :1])[flew].max(axis=1) / usable["stored_energy"][flew]
+    if len(drift):
+        said["energy audit"] = f"closes to {np.median(drift):.2g} % of the stored energy (median), {drift.max():.2g} % (worst)"
+    kinetic = usable["energies"][:, 3, ENERGY_NAMES.index("kinetic")] / usable["stored_energy"]
+    said["kinetic energy left at the end"] = f"{100 * np.median(kinetic):.2g} % of the stored energy (median)"
+    said["time"] = f"{data['cpu_seconds'].sum() / max(1, int((data['image'] == 0).sum())):.3f} s of CPU per simulated hop"
+    return said
+
+
+def measured_floor(data: HopData, hops: int) -> dict[str, str]:
+    """How far landings move when the start of a hop is moved by 10 um: nothing predicts them better than that."""
+    c = data.configuration
+    settings: dict[str, Any] = {"design": Design(**c["design"]), "scene": Scene(**c["scene"]), "lattice": Lattice(**c["lattice"])}
+    rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
+    start = form_find(data["stretches"][rows], **settings)
+    shift = np.random.default_rng(0).normal(size=start.positions.shape)
+    shift *= PERTURBATION / np.linalg.norm(shift, axis=2, keepdims=True)
+    shift[:, :, 2] = np.where(start.positions[:, :, 2] + shift[:, :, 2] < 0, 0.0, shift[:, :, 2])
+    moved = replace(start, positions=start.positions + shift)
+    how = {"dt": c["dt"], "precision": c["precision"], **settings}
+    pair = [simulate(start.stretches, equilibria=e, **how) for e in (start, moved)]
+    said = {}
+    for name in ("touchdown", "rest"):
+        apart = 1e3 * np.linalg.norm(getattr(pair[0], name) - getattr(pair[1], name), axis=1)
+        middle, high = np.percentile(apart, (50, 90))
+        said[f"{name}: floor"] = f"{middle:.2f} mm (median), {high:.2f} mm (90 %), of {len(rows)} hops started 10 µm off"
+    return said
+
+
+def report(path: Path, out: Path | None = None, floor: int = 0) -> Path:
+    """Write the page and its pictures into ``out``; returns the page's path."""
+    from surrogate import figures
+
+    data = dataset.read(path)
+    if data.configuration["scene_ranges"]:
+        raise DataFileError(
+            f"{path}: expected hops of one scene to report on, got scenes that vary; report on shards of one scene"
+        )
+    if not data.usable.any():
+        raise DataFileError(f"{path}: expected at least one usable hop, got none of {len(data)}")
+    folder = ensure_folder(out or path.with_suffix(".report"))
+    usable = data.rows(data.usable)
+    for name, (draw, _) in figures.PICTURES.items():
+        figures.save(draw, data if name == "outcomes.png" else usable, folder / name)
+    said = findings(data) | (measured_floor(data, floor) if floor else {"floor": "not measured; --floor 32 does"})
+    about = {k: str(v) for k, v in dataset.attributes(path).items() if k not in ("design", "scene")}
+    body = [
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(path.name)}</title><style>{STYLE}</style>',
+        f"<h1>{len(data)} hops</h1>",
+        _table(said),
+        *(_figure(folder / name, caption) for name, (_, caption) in figures.PICTURES.items()),
+        "<h2>What was run</h2>",
+        _table(about),
+        "</html>",
+    ]
+    page = folder / "report.html"
+    with atomic_path(page) as temporary:
+        temporary.write_text("\n".join(body), encoding="utf-8")
+    return page
+
+
+def _table(rows: dict[str, str]) -> str:
+    cells = "".join(f"<tr><td>{html.escape(k)}</td><td>{html.escape(v)}</td></tr>" for k, v in rows.items())
+    return f"<table>{cells}</table>"
+
+
+def _figure(path: Path, caption: str) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    text = html.escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
+
+
+def main(config: ReportConfig) -> None:
+    """Entry of ``python -m surrogate report``."""
+    print(report(config.file, config.out, config.floor))
