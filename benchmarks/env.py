@@ -77,10 +77,9 @@ def main(config: EnvBenchmark) -> None:
     print(f"env, reset and step             {median['env, reset and step']:.4f} s, {ratio['single']:.3f} x simulate of one hop")
     print(f"  of which outside simulate     {1e3 * own:.3f} ms, {own / median['simulate, one hop']:.2%}")
     print(f"env, reset                      {1e6 * median['env, reset'] / config.resets:.0f} us")
-    print(
-        f"vector env of {config.envs}, step           {median['vector env, step']:.4f} s, {ratio['vector']:.3f} x simulate of the batch"
-    )
-    print(f"vector env of {config.envs}                 {config.envs / median['vector env, step']:.1f} hops/s")
+    step = median["vector env, step"]
+    print(f"vector env of {config.envs}, step           {step:.4f} s, {ratio['vector']:.3f} x simulate of the batch")
+    print(f"vector env of {config.envs}                 {config.envs / step:.1f} hops/s")
     print(f"SyncVectorEnv over single envs  {few / median['sync vector env, step']:.2f} hops/s; vector env {ratio['sync']:.1f} x")
     print(f"frames of {FRAME_SIZE[0]} x {FRAME_SIZE[1]} pixels       {frames / median['frames']:.0f} per second")
 

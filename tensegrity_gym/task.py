@@ -235,9 +235,12 @@ def check_action(action: Any, shape: tuple[int, ...]) -> Floats:
     """
     low, high = STRETCH_RANGE
     try:
-        stretches = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidStretchesError(f"action: expected numbers in [{low}, {high}] of shape {shape}, got {action!r}") from None
+        given = np.asarray(action)
+    except (TypeError, ValueError):  # ragged lists
+        given = np.array("ragged")
+    if given.dtype.kind not in "fiu":
+        raise InvalidStretchesError(f"action: expected real numbers in [{low}, {high}] of shape {shape}, got {action!r}")
+    stretches = given.astype(np.float64)
     if stretches.shape != shape:
         raise InvalidStretchesError(f"action: expected shape {shape}, got {stretches.shape}")
     single = stretches.astype(np.float32)
