@@ -15,7 +15,7 @@ import numpy as np
 
 from tensegrity_gym.core.forces import MAX_SEGMENTS
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.lattice import Lattice, cell_bars, cell_nodes
+from tensegrity_gym.lattice import Lattice, cell_nodes
 from tensegrity_gym.types import Floats, Structure
 
 
@@ -256,14 +256,3 @@ class Design:
         first = lattice.n_nodes + 2 * lattice.n_cells
         inner = first + np.arange((self.bar_segments - 1) * len(lattice.bars), dtype=np.int64)
         return np.column_stack([lattice.bars[:, 0], inner.reshape(len(lattice.bars), -1), lattice.bars[:, 1]])
-
-
-def chirality_of(node: Floats) -> int:
-    """Which chirality of bars a representative node belongs to: the one that puts the cell in equilibrium (+1 or -1)."""
-    where = dict(zip(cell_nodes(), cell_node_positions(node), strict=True))
-    bar = _edge_lengths(node)[2]
-    for chi in (1, -1):
-        lengths = [np.linalg.norm(where[a] - where[b]) for a, b in cell_bars(chi)]
-        if np.allclose(lengths, bar, rtol=1e-9):
-            return chi
-    raise InvalidParameterError(f"representative node {node!r} is no self-equilibrium of the cell")

@@ -84,7 +84,7 @@ class HopStatus(IntEnum):
     """How one hop ended. Only the first two are flights; the rest still have finite landings."""
 
     RESTED = 0  #: flew, came down and came to rest
-    TIME_LIMIT = 1  #: flew, but was still moving when ``scene.duration`` was over
+    TIME_LIMIT = 1  #: flew, but was still moving, or flying, when ``scene.duration`` was over
     NO_FLIGHT = 2  #: never left the ground with every mass
     UNSTABLE = 3  #: the integration blew up; its landing reads zero, which is no answer
     NOT_CONVERGED = 4  #: no equilibrium was found to start from; not simulated

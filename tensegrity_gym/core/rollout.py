@@ -215,7 +215,7 @@ def save_frame(settings, lanes, lane, records, hop, time):
 
 
 @jit(forceinline=False)
-def verdict(settings, lanes, lane, runaway_energy, step, quiet, flown):
+def verdict(settings, lanes, lane, runaway_energy, step, quiet, flown, flying):
     """HopStatus with which a lane's hop ends now, or -1 while it goes on."""
     kinetic = lanes.scalars[KINETIC, lane]
     if not kinetic < runaway_energy:  # also true of NaN
@@ -223,7 +223,7 @@ def verdict(settings, lanes, lane, runaway_energy, step, quiet, flown):
     if quiet >= settings.rest_steps:
         return RESTED if flown else NO_FLIGHT
     if step >= settings.max_steps:
-        return TIME_LIMIT if flown else NO_FLIGHT
+        return TIME_LIMIT if flown or flying else NO_FLIGHT
     return -1
 
 
@@ -254,7 +254,8 @@ def end_hop(settings, lanes, lane, records, hop, status, step, flown):
     else:
         save_event(settings, lanes, lane, records, hop, END, step * settings.dt)
     if not flown:
-        for event in (TAKEOFF, TOUCHDOWN):
+        # still in flight: there was a take-off, and touchdown is as far as it got; no flight: neither was
+        for event in range(TOUCHDOWN if status == TIME_LIMIT else TAKEOFF, END):
             copy_state(records, hop, END, event)
             records.time[hop, event] = records.time[hop, END]
             records.dissipated[hop, event, 0] = records.dissipated[hop, END, 0]
@@ -347,7 +348,8 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
             if frames_due and step[lane] % settings.frame_stride == 0:
                 save_frame(settings, lanes, lane, records, hop[lane], step[lane] * dt)
             limit = records.runaway_energy[hop[lane]]
-            status = verdict(settings, lanes, lane, limit, step[lane], quiet[lane], flown[lane])
+            flying = lanes.scalars[AIRBORNE, lane] > 0.0 and records.time[hop[lane], TAKEOFF] > 0.0
+            status = verdict(settings, lanes, lane, limit, step[lane], quiet[lane], flown[lane], flying)
             if status < 0:
                 continue
             end_hop(settings, lanes, lane, records, hop[lane], status, step[lane], flown[lane])

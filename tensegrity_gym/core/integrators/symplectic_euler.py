@@ -1,4 +1,6 @@
-"""Symplectic Euler with a leapfrog start: positions at whole steps, velocities at half steps. Second order, one force a step.
+"""Symplectic Euler with a leapfrog start: positions at whole steps, velocities at half steps. One force a step.
+
+Second order without damping, first with: the damping force takes the rates of the half step before.
 
 Within a step the order is collisions, velocities, contacts, positions: with any other a block at rest on an incline creeps
 or bounces.

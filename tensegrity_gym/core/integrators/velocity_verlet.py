@@ -1,8 +1,8 @@
-"""Velocity Verlet: positions and velocities at whole steps. Second order, one force a step.
+"""Velocity Verlet: positions and velocities at whole steps. One force a step; second order without damping.
 
-The damping force takes the velocity of the half step, which keeps it explicit. Collisions come before the first half kick, and
-resting contacts (e = 0) after each of the two. The second must not touch a mass that has only just come down: it would stop it
-before its collision, and nothing would bounce.
+The damping force takes the velocity of the half step, which keeps it explicit but of first order. Collisions come before the
+first half kick, and resting contacts (e = 0) after each of the two. The second must not touch a mass that has only just come
+down: it would stop it before its collision, and nothing would bounce.
 """
 
 from __future__ import annotations
