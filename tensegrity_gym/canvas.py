@@ -147,6 +147,16 @@ class Canvas:
         return self.pixels
 
 
+def colour_chart(width: int, height: int = 12) -> np.ndarray:
+    """All that members are coloured with, from near to far, as stripes (h, width, 3) uint8: thin lines count for little in a
+    picture, so a palette is chosen from this beside it."""
+    along = np.linspace(0, 1, width)
+    near = [_shades(BAR_COLOURS, along), _shades(CABLE_COLOURS, along)]
+    near += [np.tile(np.array(colour, dtype=float), (width, 1)) for colour in (ACTUATOR, TRAIL, TARGET, NODE)]
+    stripes = [row + pale * (np.array(HORIZON) - row) for row in near for pale in (0.0, 0.3, 0.6)]
+    return np.repeat(np.array(stripes), height, axis=0).astype(np.uint8)
+
+
 def member_loads(positions: Floats, structure: Structure, actuator_length: Floats) -> tuple[Floats, Floats, Floats]:
     """Elastic loads over a bar's critical load [-]: bars (compression > 0), cables and actuated cables (tension > 0).
 

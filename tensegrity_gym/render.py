@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from tensegrity_gym.canvas import TRAIL, Camera, Canvas
+from tensegrity_gym.canvas import TRAIL, Camera, Canvas, colour_chart
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
 from tensegrity_gym.lattice import Lattice
@@ -291,7 +291,7 @@ def _held_lengths(positions: Floats, structure: Structure) -> Floats:
 def _write_video(pictures: list[np.ndarray], path: Path, fps: int) -> None:
     if path.suffix.lower() == ".gif":
         # one palette for all frames: the colours are few and must not flicker
-        first = Image.fromarray(pictures[len(pictures) // 2]).quantize(128)
+        first = Image.fromarray(np.concatenate([pictures[len(pictures) // 2], colour_chart(pictures[0].shape[1])])).quantize(256)
         frames = [Image.fromarray(p).quantize(palette=first, dither=Image.Dither.NONE) for p in pictures]
         frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False)
         return
