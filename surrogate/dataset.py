@@ -71,7 +71,7 @@ def write_blocks(
     ensure_folder(path.parent)
     schema = columns_of(configuration)
     with atomic_path(path) as temporary:
-        with h5py.File(temporary, "w", userblock_size=SEAL_BYTES) as file:
+        with _Sink(temporary) as sink, h5py.File(sink, "w", userblock_size=SEAL_BYTES) as file:
             seconds, hops = 0.0, 0
             writers = {name: _ColumnWriter(file, name, column) for name, column in schema.items()}
             for part in parts:
@@ -100,6 +100,56 @@ def write_blocks(
         with open(temporary, "r+b") as raw:
             raw.write(seal)
     return path
+
+
+class _Sink:
+    """A file to write HDF5 into that never fails under HDF5's feet: after an error it only pretends, and raises at the end.
+
+    HDF5 cannot close a file that it cannot write, and complains for the rest of the process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.raw = open(path, "w+b", buffering=0)
+        self.error: OSError | None = None
+
+    def __enter__(self) -> _Sink:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.raw.close()
+        if self.error is not None:
+            raise self.error
+
+    def write(self, data: Any) -> int:
+        view, done = memoryview(data).cast("B"), 0
+        try:
+            while self.error is None and done < len(view):
+                done += self.raw.write(view[done:])
+        except OSError as error:
+            self.error = error
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return self.raw.truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
+
+    def read(self, size: int = -1) -> bytes:
+        return self.raw.read(size)
+
+    def readinto(self, buffer: Any) -> int:
+        return self.raw.readinto(buffer)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return self.raw.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self.raw.tell()
+
+    def flush(self) -> None:
+        self.raw.flush()
 
 
 class _ColumnWriter:

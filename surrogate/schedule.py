@@ -55,7 +55,7 @@ def run_on_cluster(
     distributed = _distributed()
     with _client(distributed, address, workers) as client:
         waiting = iter(tasks)
-        ready = distributed.as_completed(raise_errors=False)
+        ready = distributed.as_completed(loop=client.loop, raise_errors=False)
         of: dict[str, Task] = {}
 
         def send(count: int) -> None:
