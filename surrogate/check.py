@@ -45,7 +45,7 @@ def check(path: Path | str) -> list[str]:
             problems.append("seal: the file's bytes are not those that were written (flipped, cut off, or changed since)")
     try:
         data = dataset.read(path, content=None)
-        with h5py.File(path, "r") as file:
+        with dataset.opened(path) as file:
             problems += _attributes(file, data)
     except DataFileError as error:
         return [*problems, str(error)]

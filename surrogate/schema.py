@@ -5,6 +5,7 @@ Version 1 had no per-hop index, no split share, no checksums per chunk and no ch
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from tensegrity_gym import ENERGY_NAMES, HopStatus, Lattice
@@ -93,7 +94,12 @@ def columns_of(configuration: dict[str, Any]) -> dict[str, Column]:
 
 def expected_shape(column: Column, hops: int, configuration: dict[str, Any], frames: int = 0) -> tuple[int, ...]:
     """Shape of a column's whole data set."""
-    lattice = Lattice(**configuration["lattice"])
-    lengths = {ACTUATORS: lattice.n_cells, NODES: lattice.n_nodes, FRAMES: frames}
-    lengths[MASSES] = lattice.mass_count(int(configuration["design"]["bar_segments"]))
+    lengths = {FRAMES: frames, **_lengths(**configuration["lattice"], bar_segments=int(configuration["design"]["bar_segments"]))}
     return (hops, *(lengths.get(k, k) for k in column.shape))
+
+
+@lru_cache(maxsize=8)
+def _lengths(nx: int, ny: int, bar_segments: int) -> dict[int, int]:
+    """What stands for what in column shapes; kept, since a lattice takes milliseconds to make."""
+    lattice = Lattice(nx, ny)
+    return {ACTUATORS: lattice.n_cells, NODES: lattice.n_nodes, MASSES: lattice.mass_count(bar_segments)}

@@ -68,6 +68,11 @@ def train(data: HopData, config: TrainConfig, *, progress: bool = True, desc: st
         raise InvalidParameterError(
             f"data: expected at least one usable training hop, got {len(data)} hops of which none is; generate more"
         )
+    if data.configuration.get("scene_ranges"):
+        raise InvalidParameterError(
+            f"data: expected hops of one scene, since the surrogate is told the stretches alone, got scenes that vary in "
+            f"{sorted(data.configuration['scene_ranges'])}; train on a file of one scene"
+        )
     torch.manual_seed(config.seed)
     scene, lattice = Scene(**data.configuration["scene"]), Lattice(**data.configuration["lattice"])
     net = HopNet(config.net, *model.scene_symmetries(lattice, scene))
