@@ -319,11 +319,11 @@ def test_all_frames_of_the_hop_are_a_list() -> None:
 def test_a_video_has_the_whole_hop(tmp_path: Path) -> None:
     pytest.importorskip("moviepy")
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    env = RecordVideo(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array_list"), str(tmp_path))
+    env = RecordVideo(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array_list"), str(tmp_path / "all"))
     env.reset(seed=0)
     env.step(MIDDLE)
     env.close()
-    (film,) = tmp_path.glob("*.mp4")
+    (film,) = (tmp_path / "all").glob("*.mp4")
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
     assert abs(frames - (2 + SHORT.duration * 30)) <= 1
     assert seconds == pytest.approx(frames / 30, abs=0.02)

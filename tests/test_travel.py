@@ -60,14 +60,14 @@ def test_the_pose_of_a_turned_lattice_is_read(heading: float, upside_down: bool,
 
 
 def test_hops_are_chained_where_and_how_the_last_one_came_to_rest() -> None:
-    scene = Scene.preset("slope", slope_direction=0.4)
+    scene = Scene.preset("slope", slope_direction=0.4, duration=1.2)
     env = TensegrityTravelEnv(scene=scene, distance=4.0)
     observation, info = env.reset(seed=0)
     np.testing.assert_allclose(observation[:2], info["goal"], rtol=1e-6)
     position, heading = np.zeros(2), 0.0
     for k in range(2):
         # to the last bit the angle that the env takes: tumbling hops multiply a difference by more than 1e10
-        there = replace(scene, slope_direction=travel._wrapped(0.4 - heading), duration=PATIENCE * 3.0)
+        there = replace(scene, slope_direction=travel._wrapped(0.4 - heading), duration=PATIENCE * 1.2)
         hop = simulate(UNEVEN.astype(float), scene=there, trajectory_rate=10.0)
         assert hop.trajectory is not None
         before = np.linalg.norm(info["goal"] - position)
