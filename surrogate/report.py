@@ -66,8 +66,9 @@ def findings(data: HopData) -> dict[str, str]:
             f"{axes:.3f} m at 0/90/180/270°, which the paper finds farthest, {diagonals:.3f} m at 45/135/225/315°"
         )
         along = [np.corrcoef(colour, usable[name][:, k])[0, 1] for k in (0, 1)]
+        quadrant = np.corrcoef(colour, np.sign(np.prod(usable[name], axis=1)))[0, 1]
         said[f"{name}: correlation with λ1 − λ2 + λ3 − λ4"] = (
-            f"x {along[0]:+.2f}, y {along[1]:+.2f}, distance {np.corrcoef(np.abs(colour), distance)[0, 1]:+.2f} (with its size)"
+            f"sign of xy, by quadrant, {quadrant:+.2f}, x {along[0]:+.2f}, y {along[1]:+.2f}, distance {np.corrcoef(np.abs(colour), distance)[0, 1]:+.2f} (with its size)"
         )
     mean = usable["stretches"].mean(axis=1)
     slope, _ = np.polyfit(mean, usable["apex"], 1)
