@@ -67,8 +67,9 @@ def findings(data: HopData) -> dict[str, str]:
         )
         along = [np.corrcoef(colour, usable[name][:, k])[0, 1] for k in (0, 1)]
         quadrant = np.corrcoef(colour, np.sign(np.prod(usable[name], axis=1)))[0, 1]
+        size = np.corrcoef(np.abs(colour), distance)[0, 1]
         said[f"{name}: correlation with λ1 − λ2 + λ3 − λ4"] = (
-            f"sign of xy, by quadrant, {quadrant:+.2f}, x {along[0]:+.2f}, y {along[1]:+.2f}, distance {np.corrcoef(np.abs(colour), distance)[0, 1]:+.2f} (with its size)"
+            f"x {along[0]:+.2f}, y {along[1]:+.2f}, sign of xy {quadrant:+.2f}; of its size with the distance {size:+.2f}"
         )
     mean = usable["stretches"].mean(axis=1)
     slope, _ = np.polyfit(mean, usable["apex"], 1)
