@@ -20,6 +20,7 @@ import tyro
 
 from tensegrity_gym import Design, Equilibria, Lattice, Scene, form_find, simulate
 from tensegrity_gym.searches import SearchOptions, start_positions
+from tensegrity_gym.stability import check_stability
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -36,7 +37,7 @@ class Config:
 
     quick: bool = False
     """Fewer stretches and lattices."""
-    parts: tuple[str, ...] = ("accuracy", "line_search", "cells", "throughput", "branches", "failures")
+    parts: tuple[str, ...] = ("accuracy", "line_search", "cells", "throughput", "branches", "failures", "stability")
     """Which measurements."""
     images: Path = field(default=IMAGES)
     """Folder for the charts."""
@@ -360,7 +361,7 @@ def failures(config: Config) -> None:
 
 
 def outcome(method: str, lattice: Lattice, design: Design, levels: np.ndarray) -> np.ndarray:
-    """2 where the load path's equilibrium is found, 1 where another is, 0 where none, for each stretch."""
+    """2 where the load path's equilibrium is found, 1 where another is or a finer load path finds none to compare, 0 where none."""
     batch = np.repeat(levels[:, None], lattice.n_cells, axis=1)
     batch[:, 1::2] = 0.5
     reference = form_find(batch, design=design, lattice=lattice, outside=True, options=SearchOptions(load_step=0.03))
@@ -389,6 +390,23 @@ def extremes() -> None:
         )
 
 
+def stability(config: Config) -> None:
+    """Second-order check of random equilibria, and how well the lattice's symmetries hold."""
+    batch = stretches(8 if config.quick else 24, config.seed)
+    found = form_find(batch)
+    check = check_stability(found)
+    print(
+        f"\nstable {check.stable.sum()}/{len(batch)}, lowest eigenvalue {check.eigenvalues.min():.2f} N/m, softest spin"
+        f" {check.spin_eigenvalues.min():.2f} N/m, bars past their Euler load {check.past_critical.min()} to"
+        f" {check.past_critical.max()} (by {check.load_ratio.max() - 1:.1%} at most), surface strain {check.bending_strain.max():.2%}"
+    )
+    for permutation in LATTICE.symmetries[1:]:
+        image = form_find(batch[:, permutation])
+        print(
+            f"stretches permuted by {permutation.tolist()}: energies differ by {np.abs(image.energy - found.energy).max():.1e} J"
+        )
+
+
 PARTS: dict[str, Callable[[Config], None]] = {
     "accuracy": accuracy,
     "line_search": line_search,
@@ -396,6 +414,7 @@ PARTS: dict[str, Callable[[Config], None]] = {
     "throughput": throughput,
     "branches": branches,
     "failures": failures,
+    "stability": stability,
 }
 
 
