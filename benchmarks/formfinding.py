@@ -361,7 +361,7 @@ def failures(config: Config) -> None:
 
 
 def outcome(method: str, lattice: Lattice, design: Design, levels: np.ndarray) -> np.ndarray:
-    """2 where the load path's equilibrium is found, 1 where another is or a finer load path finds none to compare, 0 where none."""
+    """2 where the load path's is found, 1 where another is or a finer load path finds none to compare with, 0 where none."""
     batch = np.repeat(levels[:, None], lattice.n_cells, axis=1)
     batch[:, 1::2] = 0.5
     reference = form_find(batch, design=design, lattice=lattice, outside=True, options=SearchOptions(load_step=0.03))
@@ -398,7 +398,8 @@ def stability(config: Config) -> None:
     print(
         f"\nstable {check.stable.sum()}/{len(batch)}, lowest eigenvalue {check.eigenvalues.min():.2f} N/m, softest spin"
         f" {check.spin_eigenvalues.min():.2f} N/m, bars past their Euler load {check.past_critical.min()} to"
-        f" {check.past_critical.max()} (by {check.load_ratio.max() - 1:.1%} at most), surface strain {check.bending_strain.max():.2%}"
+        f" {check.past_critical.max()} (by {check.load_ratio.max() - 1:.1%} at most),"
+        f" surface strain {check.bending_strain.max():.2%}"
     )
     for permutation in LATTICE.symmetries[1:]:
         image = form_find(batch[:, permutation])
