@@ -1,6 +1,7 @@
 """What the envs cost above the simulator, the vector env against SyncVectorEnv, and frames drawn per second.
 
-``python -m benchmarks.env`` prints medians of interleaved rounds.
+``python -m benchmarks.env`` prints medians of interleaved rounds. On a busy machine a lone hop on one thread
+suffers less than a batch on all of them: look at the processor time too.
 """
 
 from __future__ import annotations
@@ -58,17 +59,18 @@ def main(config: EnvBenchmark) -> None:
     for job in jobs.values():
         job()  # compiles, fills caches
     seconds: dict[str, list[float]] = {name: [] for name in jobs}
+    work: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(config.rounds):
         for name, job in jobs.items():
-            start = time.perf_counter()
+            start, cpu = time.perf_counter(), time.process_time()
             job()
             seconds[name].append(time.perf_counter() - start)
+            work[name].append(time.process_time() - cpu)
     ratio = {
         "single": np.median(np.array(seconds["env, reset and step"]) / seconds["simulate, one hop"]),
         "vector": np.median(np.array(seconds["vector env, step"]) / seconds["simulate, batch"]),
-        "sync": np.median(
-            np.array(seconds["sync vector env, step"]) / few / (np.array(seconds["vector env, step"]) / config.envs)
-        ),
+        "sync": per_hop(seconds, config, few),
+        "sync, processor": per_hop(work, config, few),
     }
     median = {name: float(np.median(values)) for name, values in seconds.items()}
     frames = int(film.frames[0])
@@ -81,7 +83,14 @@ def main(config: EnvBenchmark) -> None:
     print(f"vector env of {config.envs}, step           {step:.4f} s, {ratio['vector']:.3f} x simulate of the batch")
     print(f"vector env of {config.envs}                 {config.envs / step:.1f} hops/s")
     print(f"SyncVectorEnv over single envs  {few / median['sync vector env, step']:.2f} hops/s; vector env {ratio['sync']:.1f} x")
+    print(f"  in processor time             {ratio['sync, processor']:.1f} x: what lanes alone give, on any number of threads")
     print(f"frames of {FRAME_SIZE[0]} x {FRAME_SIZE[1]} pixels       {frames / median['frames']:.0f} per second")
+
+
+def per_hop(seconds: dict[str, list[float]], config: EnvBenchmark, few: int) -> float:
+    """What a hop in SyncVectorEnv costs over what it costs in the vector env [-]."""
+    sync, vector = (np.array(seconds[name]) for name in ("sync vector env, step", "vector env, step"))
+    return float(np.median(sync / few / (vector / config.envs)))
 
 
 def own_cost(config: EnvBenchmark, actions: np.ndarray, scene: Scene) -> float:
