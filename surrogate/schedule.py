@@ -92,7 +92,9 @@ def _client(distributed: Any, address: str, workers: int | None) -> Any:
 
     dask.config.set({"distributed.scheduler.allowed-failures": DEATHS})
     if address == "dask":
-        cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0")
+        cluster = distributed.LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        )
         client = distributed.Client(cluster, set_as_default=False)
         return _Both(client, cluster)
     if "://" not in address:
