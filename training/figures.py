@@ -18,22 +18,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from surrogate.dataset import HopData
+from surrogate.figures import COLOURS, STYLE
 from surrogate.model import OUTPUTS, target_columns
 from surrogate.storage import atomic_path
 from tensegrity_gym import ENERGY_NAMES, HopResult, render
 from training.score import Score
-
-STYLE = {
-    "font.size": 11,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "legend.frameon": False,
-    "figure.dpi": 130,
-}
-# colours that people with any colour vision tell apart (Okabe and Ito)
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#000000")
 
 
 def _style() -> AbstractContextManager[None]:

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import SAC
@@ -86,22 +85,6 @@ class _Watch(BaseCallback):
         for budget in self.budgets:
             if self.num_timesteps >= budget and budget not in self.snapshots:
                 self.snapshots[budget] = ActorPolicy.from_sac(self.model, self.scale)
-
-
-class ScaledAction(gym.ActionWrapper):
-    """Actions in [-1, 1] onto the env's range; gymnasium's RescaleAction rounds beyond its ends, this one does not."""
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        box = env.action_space
-        assert isinstance(box, gym.spaces.Box)
-        self.box = box
-        self.action_space = gym.spaces.Box(-1.0, 1.0, shape=box.shape, dtype=np.float32)
-
-    def action(self, action: np.ndarray) -> np.ndarray:
-        """Stretches, shape as it came."""
-        low, high = self.box.low, self.box.high
-        return np.clip(low + (high - low) * (action + 1) / 2, low, high)
 
 
 @one_thread()
