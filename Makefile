@@ -26,7 +26,7 @@ format: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -c constraints.txt -e '.[learn,video,dev]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[learn,video,cluster,export,dev]'
 	touch $@
 
 clean:
