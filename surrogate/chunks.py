@@ -18,11 +18,6 @@ from tensegrity_gym.types import Floats
 Progress = Callable[[int], object]
 
 
-#: numpy sums a batch of one in another order, and so to other last bits, than a hop among others; the simulator measures
-#: hops in batches of this many.
-BATCH = 512
-
-
 class Task(NamedTuple):
     """Hops ``first`` to ``last`` (excluded) of a configuration, with their stretches where these come from a file."""
 
@@ -64,10 +59,7 @@ def _one_scene(
     threads: int | None,
     progress: Progress | None,
 ) -> HopData:
-    wall, cpu, n = time.perf_counter(), time.process_time(), len(stretches)
-    if n % BATCH == 1:  # a double at the end keeps company and costs nothing: lanes come by the dozen
-        stretches = np.concatenate([stretches, stretches[-1:]])
-        index = np.append(index, index[-1])
+    wall, cpu = time.perf_counter(), time.process_time()
     scene = replace(configuration.scene, **values)  # type: ignore[arg-type]
     common = {"design": configuration.design, "scene": scene, "lattice": configuration.lattice, "threads": threads}
     if configuration.content == "equilibria":
@@ -85,4 +77,4 @@ def _one_scene(
         )
         make = from_result  # type: ignore[assignment]
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    return make(result, configuration, wall, index=index, cpu_seconds=cpu, scene_values=values).rows(slice(0, n))
+    return make(result, configuration, wall, index=index, cpu_seconds=cpu, scene_values=values)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
+import gymnasium
 import h5py
 import numpy as np
 import tyro
@@ -16,8 +17,11 @@ import tyro
 from surrogate import dataset
 from surrogate.hops import HopData
 from surrogate.storage import atomic_path, ensure_folder
-from tensegrity_gym import STRETCH_RANGE, Scene, __version__
+from tensegrity_gym import Design, Lattice, __version__
+from tensegrity_gym.env import HopTask
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, MissingExtraError
+from tensegrity_gym.scene_ranges import SCENE_VALUES
+from tensegrity_gym.task import TARGET_LIMIT, observe, reach, reachable_middle
 
 #: Version of Minari whose layout is written.
 MINARI = "0.5.3"
@@ -83,34 +87,35 @@ def to_parquet(path: Path, out: Path) -> None:
 def to_minari(path: Path, folder: Path) -> None:
     """One-step episodes of the env with the target set, in hindsight, to where the hop landed: reward 0, the best there is.
 
-    Files as Minari 0.5 keeps them: data/main_data.hdf5 and data/metadata.json. Simulated hops alone, no symmetry images.
+    Files as Minari 0.5 keeps them: data/main_data.hdf5 and data/metadata.json. Simulated hops alone, no symmetry images, and
+    none whose landing lies farther than targets of the env may.
     """
     about = dataset.attributes(path)
-    configuration = about["configuration"]
-    scene = Scene(**configuration["scene"])
+    arguments = _env_arguments(about["configuration"])
+    task = HopTask(**arguments)
     data = ensure_folder(folder / "data")
     episodes = 0
     with atomic_path(data / "main_data.hdf5") as temporary, h5py.File(temporary, "w") as file:
         for part in dataset.blocks(path):
-            for row in np.flatnonzero(part.usable & (part["image"] == 0)):
-                _episode(file.create_group(f"episode_{episodes}"), part, int(row), episodes)
+            seen = _observations(part, task)
+            for row in np.flatnonzero(part.usable & (part["image"] == 0) & np.isfinite(seen).all(axis=1)):
+                _episode(file.create_group(f"episode_{episodes}"), part, int(row), episodes, seen[row])
                 episodes += 1
-    size = (data / "main_data.hdf5").stat().st_size / 1e6
-    low, high = STRETCH_RANGE
-    n = len(part["stretches"][0]) if episodes else 4
+    spec = json.loads(gymnasium.spec("TensegrityHop-v0").to_json())
+    spec["kwargs"] = arguments
     metadata = {
         "dataset_id": f"tensegrity/{path.stem}-v0",
         "total_episodes": episodes,
         "total_steps": episodes,
         "data_format": "hdf5",
-        "observation_space": json.dumps(_box([-1e3] * 2, [1e3] * 2)),
-        "action_space": json.dumps(_box([low] * n, [high] * n)),
-        "env_spec": json.dumps(_env_spec(scene)),
+        "observation_space": json.dumps(_box(task.observation_space)),
+        "action_space": json.dumps(_box(task.action_space)),
+        "env_spec": json.dumps(spec),
         "minari_version": MINARI,
         "requirements": [f"tensegrity-gym=={__version__}"],
-        "algorithm_name": f"stretches by {configuration['sampler']}",
+        "algorithm_name": f"stretches by {about['configuration']['sampler']}",
         "description": "Hops of a soft tensegrity lattice; each target is, in hindsight, the landing.",
-        "dataset_size": size,
+        "dataset_size": (data / "main_data.hdf5").stat().st_size / 1e6,
         "configuration_hash": about["configuration_hash"],
         "digest": about["digest"],
     }
@@ -118,11 +123,35 @@ def to_minari(path: Path, folder: Path) -> None:
         temporary.write_text(json.dumps(metadata, indent=1), encoding="utf-8")
 
 
-def _episode(group: h5py.Group, part: HopData, row: int, number: int) -> None:
-    target = part["landing"][row].astype(np.float32)
+def _env_arguments(configuration: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of the env that makes these hops; InvalidParameterError where none does."""
+    ranges = configuration["scene_ranges"]
+    foreign = [k for k, made in (("design", Design()), ("lattice", Lattice(2, 2))) if configuration[k] != asdict(made)]
+    foreign += [f"ranges of {name}" for name in ranges if name not in SCENE_VALUES]
+    if foreign:
+        raise InvalidParameterError(
+            f"--minari: expected hops that TensegrityHop-v0 can make, got other {' and '.join(foreign)}; export .csv or .parquet"
+        )
+    levers = {k: configuration[k] for k in ("dt", "precision") if configuration[k] is not None}
+    values = {k: low if low == high else [low, high] for k, (low, high) in ranges.items()}
+    return {"scene": configuration["scene"] | values, "fidelity": levers}
+
+
+def _observations(part: HopData, task: HopTask) -> np.ndarray:
+    """What each hop's episode observed, its landing being the target, shape (n, 2 + k); NaN where no target may lie."""
+    names = task.scenes.observed
+    seen = np.full((len(part), 2 + len(names)), np.nan, dtype=np.float32)
+    for row, landing in enumerate(part["landing"]):
+        scene = task.scenes.changed(task.scenes.base, {name: float(part[f"scene_{name}"][row]) for name in names})
+        if np.hypot(*(landing - reachable_middle(scene))) <= TARGET_LIMIT * reach(scene):
+            seen[row] = observe(landing, scene, names)
+    return seen
+
+
+def _episode(group: h5py.Group, part: HopData, row: int, number: int, seen: np.ndarray) -> None:
     group.attrs["id"] = number
     group.attrs["total_steps"] = 1
-    group.create_dataset("observations", data=np.stack([target, target]))
+    group.create_dataset("observations", data=np.stack([seen, seen]))
     group.create_dataset("actions", data=part["stretches"][row : row + 1].astype(np.float32))
     group.create_dataset("rewards", data=np.zeros(1))
     group.create_dataset("terminations", data=np.ones(1, dtype=bool))
@@ -132,16 +161,9 @@ def _episode(group: h5py.Group, part: HopData, row: int, number: int) -> None:
         infos.create_dataset(name, data=np.repeat(part[name][row : row + 1], 2))
 
 
-def _box(low: list[float], high: list[float]) -> dict[str, Any]:
-    return {"type": "Box", "dtype": "float32", "shape": [len(low)], "low": low, "high": high}
-
-
-def _env_spec(scene: Scene) -> dict[str, Any]:
-    import gymnasium
-
-    spec = json.loads(gymnasium.spec("TensegrityHop-v0").to_json())
-    spec["kwargs"] = {**spec.get("kwargs", {}), "scene": {**{k: getattr(scene, k) for k in scene.__dataclass_fields__}}}
-    return spec
+def _box(space: gymnasium.spaces.Box) -> dict[str, Any]:
+    low, high = space.low.tolist(), space.high.tolist()
+    return {"type": "Box", "dtype": str(space.dtype), "shape": list(space.shape), "low": low, "high": high}
 
 
 def main(config: ExportConfig) -> None:

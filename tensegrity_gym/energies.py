@@ -26,6 +26,14 @@ def _segments(positions: Floats, bars: Ints) -> Floats:
     return np.diff(positions[:, bars], axis=2)
 
 
+def _added(energies: Floats) -> Floats:
+    """Sum over the members of each state, (n, ...) -> (n,): one after the other, in the same order for every n.
+
+    ``sum`` goes by the arrays' strides, so that a batch of one would differ from a larger one in the last bit.
+    """
+    return np.cumsum(energies.reshape(len(energies), -1), axis=1)[:, -1] if energies.size else np.zeros(len(energies))
+
+
 def hinge_angles(positions: Floats, bars: Ints) -> Floats:
     """Angles between consecutive segments [rad], shape (n, n_bars, n_segments - 1)."""
     vectors = _segments(positions, bars)
@@ -45,9 +53,9 @@ def elastic_energies(structure: Structure, positions: Floats, actuator_lengths: 
     cables = np.maximum(_lengths(positions, structure.cables) - structure.cable_length, 0.0)
     actuators = np.maximum(_lengths(positions, structure.actuators) - actuator_lengths, 0.0)
     return {
-        "bars": axial.sum(axis=(1, 2)) + bending.sum(axis=(1, 2)),
-        "cables": (0.5 * structure.cable_stiffness * cables**2).sum(axis=1),
-        "actuators": (0.5 * structure.actuator_rigidity / actuator_lengths * actuators**2).sum(axis=1),
+        "bars": _added(axial) + _added(bending),
+        "cables": _added(0.5 * structure.cable_stiffness * cables**2),
+        "actuators": _added(0.5 * structure.actuator_rigidity / actuator_lengths * actuators**2),
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from typing import Any
 
@@ -56,9 +56,10 @@ class SceneRanges:
 
     def changed(self, scene: Scene, values: Mapping[str, Any]) -> Scene:
         """``scene`` with some of its values changed; InvalidParameterError for values that no scene has."""
-        unknown = [k for k in values if k not in Scene.__dataclass_fields__]
+        known = {f.name for f in fields(Scene)}
+        unknown = [k for k in values if k not in known]
         if unknown:
-            raise InvalidParameterError(f"scene: expected keys out of {sorted(Scene.__dataclass_fields__)}, got {unknown}")
+            raise InvalidParameterError(f"scene: expected keys out of {sorted(known)}, got {unknown}")
         return replace(scene, **values)
 
 

@@ -89,3 +89,25 @@ def test_rigid_motions_change_no_elastic_energy() -> None:
         # dE = sum T dl, dl of eps: sqrt(2 k E) bounds a tension
         blur = 8 * EPS * (np.sqrt(2 * s.segment_stiffness.max() * energy) * len(s.cables) + energy * 100)
         assert (np.abs(after[name] - energy) <= blur + EPS).all()
+
+
+@pytest.mark.parametrize("segments", [1, 3])
+@pytest.mark.parametrize("cells", [(2, 1), (2, 2)])
+def test_a_state_alone_has_the_bits_that_it_has_among_others(segments: int, cells: tuple[int, int]) -> None:
+    design, lattice, rng = Design(bar_segments=segments), Lattice(*cells), np.random.default_rng(segments)
+    s = design.structure(lattice)
+    x = design.unloaded_positions(lattice) + 0.02 * rng.normal(size=(12, len(s.mass), 3))
+    v = rng.normal(size=x.shape)
+    lengths = s.actuator_length * rng.uniform(0.3, 1.1, size=(12, lattice.n_cells))
+
+    def everything(rows: slice) -> dict[str, np.ndarray]:
+        found = elastic_energies(s, x[rows], lengths[rows]) | member_forces(s, x[rows], lengths[rows])._asdict()
+        found |= {"kinetic": kinetic_energy(s, v[rows]), "gravitational": gravitational_energy(s, GRAVITY, x[rows])}
+        return found | {"centre": centre_of_mass(s, x[rows]), "hinges": hinge_angles(x[rows], s.bars)}
+
+    together = everything(slice(None))
+    for size in (1, 2, 5):
+        for first in range(0, 12 - size, size):
+            rows = slice(first, first + size)
+            for name, alone in everything(rows).items():
+                np.testing.assert_array_equal(alone, together[name][rows], err_msg=f"{name}, {size} states")

@@ -437,6 +437,7 @@ def test_options_that_mean_nothing_are_refused(options: dict[str, Any], said: st
         ({"scene": "pluto"}, UnknownPresetError, "expected one of"),
         ({"scene": 9.8}, InvalidParameterError, "scene: expected a preset's name"),
         ({"scene": {"air": 1.0}}, InvalidParameterError, "scene: expected keys out of"),
+        ({"scene": {"PRESETS": 1.0}}, InvalidParameterError, "scene: expected keys out of"),  # of the class, not of a scene
         ({"scene": {"duration": (1.0, 2.0)}}, InvalidParameterError, "scene ranges: expected keys out of"),
         ({"scene": {"gravity": (9.8, 1.6)}}, InvalidParameterError, "expected low < high"),
         ({"scene": {"gravity": (1.6, np.nan)}}, InvalidParameterError, "two finite numbers"),

@@ -98,9 +98,40 @@ def test_minari_layout(hops: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(episode["observations"][0], data["landing"][5].astype("f4"))
         np.testing.assert_array_equal(episode["actions"][0], data["stretches"][5].astype("f4"))
         assert episode["terminations"][()].tolist() == [True]
+    with pytest.raises(DataFileError, match="not to be there"):
+        export(ExportConfig(hops, tmp_path / "hops-v0", minari=True))
+
+
+@pytest.mark.parametrize("ranges", [{}, {"gravity": (5.0, 9.0), "friction": (0.4, 0.4)}], ids=["one scene", "ranges"])
+def test_minari_plays_the_episodes_again(tmp_path: Path, ranges: dict[str, tuple[float, float]]) -> None:
+    """Minari itself reads the episodes and makes their env, in which they come out as they are written."""
     minari = pytest.importorskip("minari")
+    scene = Scene(duration=1.3, landing="touchdown")
+    path = tmp_path / "hops.h5"
+    generate.fill(path, 3, Configuration(scene=scene, scene_ranges=ranges, hops_per_scene=2), progress=False)
+    export(ExportConfig(path, tmp_path / "hops-v0", minari=True))
     back = minari.MinariDataset(str(tmp_path / "hops-v0" / "data"))
-    np.testing.assert_array_equal(back[5].actions[0], data["stretches"][5].astype("f4"))
+    env = back.recover_environment()
+    assert (env.observation_space, env.action_space) == (back.observation_space, back.action_space)
+    data = dataset.read(path)
+    for k in range(len(back)):
+        episode = back[k]
+        np.testing.assert_array_equal(episode.actions[0], data["stretches"][k].astype("f4"))
+        assert back.observation_space.contains(episode.observations[0])
+        options: dict = {"target": data["landing"][k]}
+        if ranges:
+            options["scene"] = {"gravity": float(data["scene_gravity"][k])}
+        np.testing.assert_array_equal(env.reset(options=options)[0], episode.observations[0])
+        # actions and targets are float32, and a hop moves by 16 times (0.16 mm of 10 um) what its start does
+        assert env.step(episode.actions[0])[1] == pytest.approx(episode.rewards[0], abs=1e-3)
+
+
+def test_hops_that_no_env_makes_are_no_minari_episodes(tmp_path: Path) -> None:
+    configuration = Configuration(scene=Scene(duration=0.01), scene_ranges={"restitution": (0.0, 0.5)})
+    generate.fill(tmp_path / "hops.h5", 2, configuration, progress=False)
+    with pytest.raises(InvalidParameterError, match=r"--minari: .*other ranges of restitution; export .csv"):
+        export(ExportConfig(tmp_path / "hops.h5", tmp_path / "hops-v0", minari=True))
+    assert not (tmp_path / "hops-v0").exists()
 
 
 def test_report_is_one_page_with_its_pictures(hops: Path, tmp_path: Path) -> None:
