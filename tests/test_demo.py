@@ -16,7 +16,7 @@ from surrogate.train import TrainConfig
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, OutputFolderError
 from training import demo
 from training.demo import DemoConfig
-from training.planner import InverseConfig
+from training.inverse import InverseConfig
 
 SMALL = DemoConfig(
     hops=16,

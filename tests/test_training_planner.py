@@ -11,8 +11,11 @@ from torch import Tensor
 
 from surrogate.generate import sample_stretches
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
-from training.planner import InversePlanner, NearestHopPlanner, targets_of
+from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.inverse import InverseConfig, InversePlanner, fit_energy
+from training.planner import BestOfPlanner, NearestHopPlanner, targets_of
 from training.policies import ActorPolicy, _mlp
+from training.tandem import TandemConfig, TandemPlanner
 
 
 def throw(stretches: Tensor) -> Tensor:
@@ -45,10 +48,21 @@ def test_answers_on_the_boundary_of_the_box_are_reached() -> None:
     def linear(stretches: Tensor) -> Tensor:
         return stretches[None, :, :2]
 
-    stretches, expected = InversePlanner(linear).plan(np.array([(0.2, 0.8), (0.1, 0.9)]))
-    np.testing.assert_allclose(stretches[:, :2], [(0.2, 0.8)] * 2, atol=1e-6)
+    plans = InversePlanner(linear).plan(np.array([(0.2, 0.8), (0.1, 0.9)]))
+    np.testing.assert_allclose(plans.stretches[:, :2], [(0.2, 0.8)] * 2, atol=1e-6)
     # the second target is out of reach: the nearest landing, and said so
-    np.testing.assert_allclose(expected, [0.0, np.hypot(0.1, 0.1)], atol=1e-5)
+    np.testing.assert_allclose(plans.errors, [0.0, np.hypot(0.1, 0.1)], atol=2e-5)
+    np.testing.assert_allclose(plans.landings, [(0.2, 0.8)] * 2, atol=1e-6)
+    assert plans.reachable.tolist() == [True, False]
+
+
+def test_beyond_an_arms_length_it_points_at_the_target() -> None:
+    directions = np.linspace(-0.6, 0.6, 7)
+    targets = 1.3 * np.column_stack([np.cos(directions), np.sin(directions)])
+    plans = InversePlanner(arm, InverseConfig(steps=20)).plan(targets)
+    assert not plans.reachable.any()
+    np.testing.assert_allclose(plans.errors, 0.3, atol=1e-3)  # the arm is 1 m long
+    np.testing.assert_allclose(plans.landings, targets / 1.3, atol=0.03)
 
 
 def test_prefers_stretches_that_the_members_agree_on() -> None:
@@ -70,6 +84,92 @@ def test_same_question_same_answer_and_single_or_batch() -> None:
     assert single.shape == (4,)
     assert state is None
     np.testing.assert_allclose(single, batch[0], atol=1e-4)
+
+
+def test_of_equal_answers_the_one_that_stores_least_energy() -> None:
+    def linear(stretches: Tensor) -> Tensor:
+        return stretches[None, :, :2]
+
+    def energy(stretches: np.ndarray) -> np.ndarray:
+        return 10 - 3 * stretches[:, 2] - 3 * stretches[:, 3] ** 2
+
+    targets = np.random.default_rng(0).uniform(0.3, 0.7, (20, 2))
+    anything = InversePlanner(linear, InverseConfig(starts=32))
+    frugal = InversePlanner(linear, InverseConfig(starts=32), energy=energy)
+    assert frugal.plan(targets).errors.max() < 1e-3
+    choices = anything.propose(targets, 8)
+    cheapest = energy(choices.reshape(-1, 4)).reshape(20, 8).min(axis=1)
+    assert (energy(frugal.plan(targets).stretches) <= cheapest + 1e-6).all()
+    # a quadratic is fitted exactly
+    stretches = sample_stretches(64, 3)
+    np.testing.assert_allclose(fit_energy(stretches, energy(stretches))(choices[0]), energy(choices[0]), atol=1e-9)
+
+
+def test_proposals_differ_and_best_of_them_is_found_by_simulating() -> None:
+    """The surrogate is off by a different shift in each half of the box: only simulating tells which answers are good."""
+
+    def real(stretches: np.ndarray) -> np.ndarray:
+        return stretches[:, :2] + 0.05 * (stretches[:, 2:3] > 0.5)
+
+    planner = InversePlanner(lambda s: s[None, :, :2])
+    targets = np.random.default_rng(1).uniform(0.3, 0.7, (12, 2))
+    proposed = planner.propose(targets, 8)
+    gaps = np.abs(proposed[:, :, None] - proposed[:, None]).max(axis=3) + np.eye(8)
+    assert gaps.min() >= 0.01
+    best = BestOfPlanner(planner, real, tries=8)
+    error = np.linalg.norm(real(best.predict(targets)[0]) - targets, axis=1)
+    assert error.max() < 1e-3
+    assert best.simulator_calls == 12 * 8
+    lost = BestOfPlanner(planner, lambda s: np.where(s[:, 2:3] > 0.5, np.nan, real(s)), tries=8)
+    assert (lost.predict(targets)[0][:, 2] <= 0.5).all()  # failed hops are never chosen
+    with pytest.raises(InvalidParameterError, match="tries"):
+        BestOfPlanner(planner, real, tries=0)
+
+
+@pytest.mark.parametrize("reach", [throw, arm])
+def test_tandem_net_learns_an_inverse(reach) -> None:
+    def see(stretches: Tensor) -> tuple[Tensor, Tensor]:
+        return reach(stretches)[0], torch.zeros(len(stretches))
+
+    landings = reach(torch.from_numpy(sample_stretches(2000, 3).astype(np.float32)))[0].numpy()
+    planner = TandemPlanner(see, landings, TandemConfig(steps=500))
+    targets = landings[1000:1100]
+    stretches, _ = planner.predict(targets)
+    found = reach(torch.from_numpy(stretches.astype(np.float32)))[0].numpy()
+    error = np.linalg.norm(found - targets, axis=1)
+    assert np.median(error) < 0.03 * np.linalg.norm(landings, axis=1).max()
+    np.testing.assert_allclose(planner.predict(targets[0])[0], stretches[0], atol=1e-6)
+
+
+def test_tandem_net_answers_mirrored_targets_with_mirrored_stretches() -> None:
+    permutations, signs = np.array([(0, 1, 2, 3), (1, 0, 3, 2)]), np.array([(1, 1), (1, -1)])
+
+    def see(stretches: Tensor) -> tuple[Tensor, Tensor]:
+        y = stretches[:, 0] - stretches[:, 1]
+        return torch.stack([stretches[:, 2] + stretches[:, 3], y], dim=1), torch.zeros(len(stretches))
+
+    landings = see(torch.from_numpy(sample_stretches(500, 3)))[0].numpy()
+    planner = TandemPlanner(see, landings, TandemConfig(steps=20), permutations=permutations, signs=signs)
+    above, below = np.array([(0.9, 0.2)]), np.array([(0.9, -0.2)])
+    np.testing.assert_array_equal(planner.predict(above)[0][:, [1, 0, 3, 2]], planner.predict(below)[0])
+
+
+@pytest.mark.parametrize("reach", [throw, arm])
+def test_evolution_recovers_inverses_and_counts_its_calls(reach) -> None:
+    pytest.importorskip("cma")
+
+    def land(stretches: np.ndarray) -> np.ndarray:
+        return reach(torch.from_numpy(stretches))[0].numpy()
+
+    hidden = sample_stretches(6, 11)
+    targets = land(hidden)
+    start = NearestHopPlanner(sample_stretches(50, 0), land(sample_stretches(50, 0)))
+    planner = EvolutionPlanner(land, start, EvolutionConfig(evaluations=800))
+    stretches, _ = planner.predict(targets)
+    assert np.linalg.norm(land(stretches) - targets, axis=1).max() < 1e-3
+    assert planner.calls == 6 * 800
+    assert stretches.min() >= 0.2
+    assert stretches.max() <= 0.8
 
 
 def test_nearest_hop_is_the_nearest() -> None:

@@ -20,7 +20,8 @@ from tensegrity_gym import MODEL_VERSION, Scene, simulate
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.task import reach
 from training import figures, report
-from training.planner import InverseConfig, InversePlanner, NearestHopPlanner, Planner
+from training.inverse import InverseConfig, InversePlanner
+from training.planner import NearestHopPlanner, Planner
 from training.policies import ActorPolicy
 from training.score import Score, score_stretches
 from training.stages import Results, Stages

@@ -1,0 +1,201 @@
+"""Inversion of a learned map from many starts: which stretches does the surrogate expect to land on the target?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogate.generate import sample_stretches
+from surrogate.model import one_thread
+from tensegrity_gym import STRETCH_RANGE
+from tensegrity_gym.errors import InvalidParameterError
+from training.planner import Prediction, targets_of
+
+#: Added to the variance under the root, so that its derivative exists where it is zero [m^2].
+LEAST_VARIANCE = 1e-10
+#: Proposals differ in some stretch by at least this [-].
+DISTINCT = 0.01
+
+
+@dataclass(frozen=True)
+class InverseConfig:
+    """Levenberg-Marquardt through the surrogate from many starts."""
+
+    pool: int = 4096
+    """Spread-out stretches that the starts are chosen from."""
+    starts: int = 8
+    """Descents per target."""
+    steps: int = 8
+    """Steps per descent."""
+    damping: float = 1e-4
+    """Damping at the first step, as a share of the squared reach of the pool; it falls with every step that helps."""
+    equal: float = 0.002
+    """Answers whose expected error is within this of the least count as equals, among which the least energy wins [m]."""
+    miss: float = 0.01
+    """A target is called unreachable if the nearest known landing is farther away than this [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("pool", "starts", "steps"):
+            if getattr(self, name) < 1:
+                raise InvalidParameterError(f"{name}: expected an integer >= 1, got {getattr(self, name)}")
+
+
+class Plans(NamedTuple):
+    """Answers to n targets."""
+
+    stretches: np.ndarray  #: shape (n, n_actuators) [-]
+    landings: np.ndarray  #: expected, mean over the members, shape (n, 2) [m]
+    errors: np.ndarray  #: expected, root mean square over members and scatter, shape (n,) [m]
+    reachable: np.ndarray  #: False where ``landings`` is only the nearest landing known, shape (n,)
+
+
+class InversePlanner:
+    """Find the stretches whose expected squared landing error is least.
+
+    The expected square is that of the mean landing's distance to the target plus the variance: the members' spread and,
+    with a ``correction``, the doubt that distance from the stored hops brings. So among the many stretches that reach a
+    target, a surface in the box, it takes those that it is surest of. Both are residuals of one least-squares problem,
+    solved by Levenberg-Marquardt steps; stretches at the end of their range that would leave it are held there for the
+    step, so that answers on the box's boundary are reached.
+
+    Args:
+        landing: stretches, shape (n, n_actuators), to landings as each member sees them, shape (members, n, 2) [m].
+        correction: stretches to a shift of the landing, shape (n, 2) [m], and a variance, shape (n,) [m^2] a direction.
+        energy: stretches to the energy that they store, shape (n,) [J]: chooses among equals.
+        stored: stretches to start from besides the spread-out ones, shape (m, n_actuators).
+    """
+
+    def __init__(
+        self,
+        landing: Callable[[Tensor], Tensor],
+        config: InverseConfig | None = None,
+        *,
+        correction: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
+        energy: Callable[[np.ndarray], np.ndarray] | None = None,
+        stored: np.ndarray | None = None,
+        n_actuators: int = 4,
+        seed: int = 0,
+    ) -> None:
+        self.landing, self.correction, self.energy = landing, correction, energy
+        self.config = config or InverseConfig()
+        pool = sample_stretches(self.config.pool, seed, n_actuators)
+        self.pool = torch.from_numpy((pool if stored is None else np.concatenate([pool, stored])).astype(np.float32))
+        with torch.no_grad():
+            self.pool_seen = self.see(self.pool)
+        self.scale = float((self.pool_seen[0] ** 2).sum(dim=1).quantile(0.95)) or 1.0  # squared reach [m^2]
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Prediction:
+        """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4); unreachable ones get the nearest landing it knows."""
+        stretches = self.plan(targets_of(observation)).stretches
+        return (stretches[0] if np.ndim(observation) == 1 else stretches), state
+
+    def plan(self, targets: np.ndarray) -> Plans:
+        """Answers to targets (n, 2) [m], with what is expected of them."""
+        goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))
+        found, cost = self._search(goal, self.config.starts)
+        best = cost.argmin(dim=1) if self.energy is None else self._least_energy(found, cost)
+        rows = torch.arange(len(best))
+        with torch.no_grad():
+            landings = self.see(found[rows, best])[0]
+        nearest = torch.linalg.norm(landings - goal, dim=1)
+        errors = torch.sqrt(cost[rows, best])
+        return Plans(_in_range(found[rows, best]), landings.numpy(), errors.numpy(), (nearest <= self.config.miss).numpy())
+
+    def propose(self, targets: np.ndarray, count: int) -> np.ndarray:
+        """``count`` different answers to each target (n, 2) [m], best first, shape (n, count, n_actuators).
+
+        Where descents end in fewer different places, the last ones repeat the best.
+        """
+        goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))
+        found, cost = self._search(goal, max(self.config.starts, 2 * count))
+        order = cost.argsort(dim=1)
+        found = torch.gather(found, 1, order[..., None].expand_as(found))
+        return np.stack([_distinct(row, count) for row in _in_range(found)])
+
+    def see(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean landing (n, 2) [m] and its variance, both directions added (n,) [m^2], at stretches (n, n_actuators)."""
+        landings = self.landing(stretches)
+        mean = landings.mean(dim=0)
+        variance = ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
+        if self.correction is None:
+            return mean, variance
+        shift, doubt = self.correction(stretches)
+        return mean + shift, variance + 2 * doubt
+
+    @one_thread()
+    def _search(self, goal: Tensor, starts: int) -> tuple[Tensor, Tensor]:
+        """Ends of the descents (n, starts, n_actuators) and their expected squares (n, starts) [m^2]."""
+        mean, variance = self.pool_seen
+        first = (torch.cdist(goal, mean) ** 2 + variance).topk(min(starts, len(self.pool)), largest=False).indices
+        n, starts = first.shape
+        stretches, cost = self._descend(self.pool[first].reshape(n * starts, -1), goal.repeat_interleave(starts, dim=0))
+        return stretches.reshape(n, starts, -1), cost.reshape(n, starts)
+
+    def _descend(self, best: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        low, high = STRETCH_RANGE
+        residual, slope = self._residual(best, goal)
+        cost = (residual**2).sum(dim=1)
+        damping = torch.full_like(cost, self.config.damping * self.scale)
+        eye = torch.eye(residual.shape[1])
+        for _ in range(self.config.steps):
+            downhill = -(slope * residual[..., None]).sum(dim=1)  # (n, n_actuators)
+            held = ((best <= low) & (downhill < 0)) | ((best >= high) & (downhill > 0))
+            free = slope.masked_fill(held[:, None], 0.0)
+            # (J'J + d I)^-1 J' = J' (J J' + d I)^-1, and the latter is but 3 by 3
+            system = free @ free.mT + damping[:, None, None] * eye
+            tried = (best - (free.mT @ torch.linalg.solve(system, residual[..., None]))[..., 0]).clamp(low, high)
+            tried_residual, tried_slope = self._residual(tried, goal)
+            tried_cost = (tried_residual**2).sum(dim=1)
+            better = tried_cost < cost
+            best, cost = torch.where(better[:, None], tried, best), torch.where(better, tried_cost, cost)
+            residual = torch.where(better[:, None], tried_residual, residual)
+            slope = torch.where(better[:, None, None], tried_slope, slope)
+            damping = torch.where(better, damping / 8, damping * 4)
+        return best, cost
+
+    def _residual(self, stretches: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Landing minus goal and the root of the variance, (n, 3) [m], and their derivatives, (n, 3, n_actuators) [m]."""
+        stretches = stretches.detach().requires_grad_(True)
+        mean, variance = self.see(stretches)
+        residual = torch.cat([mean - goal, torch.sqrt(variance + LEAST_VARIANCE)[:, None]], dim=1)
+        rows = [torch.autograd.grad(residual[:, k].sum(), stretches, retain_graph=k < 2)[0] for k in range(3)]
+        return residual.detach(), torch.stack(rows, dim=1)
+
+    def _least_energy(self, found: Tensor, cost: Tensor) -> Tensor:
+        assert self.energy is not None
+        energies = torch.from_numpy(self.energy(_in_range(found).reshape(-1, found.shape[2]))).reshape(cost.shape)
+        error = torch.sqrt(cost)
+        equals = error <= error.min(dim=1, keepdim=True).values + self.config.equal
+        return torch.where(equals, energies, torch.inf).argmin(dim=1)
+
+
+def _in_range(stretches: Tensor) -> np.ndarray:
+    # float32 cannot hold 0.2 and 0.8: cut the overshoot off
+    return np.clip(stretches.numpy().astype(np.float64), *STRETCH_RANGE)
+
+
+def _distinct(found: np.ndarray, count: int) -> np.ndarray:
+    """The first ``count`` rows that differ from those before them; filled up with the first."""
+    chosen = [found[0]]
+    for row in found[1:]:
+        if len(chosen) < count and min(np.abs(row - c).max() for c in chosen) >= DISTINCT:
+            chosen.append(row)
+    return np.stack(chosen + [found[0]] * (count - len(chosen)))
+
+
+def fit_energy(stretches: np.ndarray, energies: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Stored energy as a quadratic of the stretches, fitted by least squares: (m, n_actuators) and (m,) [J] to a function."""
+
+    def features(at: np.ndarray) -> np.ndarray:
+        upper = np.triu_indices(at.shape[1])
+        return np.concatenate([np.ones((len(at), 1)), at, (at[:, :, None] * at[:, None])[:, upper[0], upper[1]]], axis=1)
+
+    weights = np.linalg.lstsq(features(np.asarray(stretches)), np.asarray(energies), rcond=None)[0]
+    return lambda at: features(at) @ weights
