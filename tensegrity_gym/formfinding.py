@@ -13,7 +13,16 @@ from tensegrity_gym.energies import elastic_energies, member_forces
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.searches import SEARCHES, TOLERANCE, Found, Problem, SearchOptions, imperfection_forces, start_positions
+from tensegrity_gym.searches import (
+    SEARCHES,
+    TOLERANCE,
+    Found,
+    Problem,
+    SearchOptions,
+    built,
+    imperfection_forces,
+    start_positions,
+)
 from tensegrity_gym.types import Floats, Structure
 
 __all__ = [
@@ -143,11 +152,11 @@ def form_find(
     values = as_stretches(stretches, lattice, *(WIDEST_RANGE if outside else STRETCH_RANGE))
     if method not in METHODS:
         raise InvalidParameterError(f"form_find: expected method in {METHODS}, got {method!r}")
-    structure = design.structure(lattice)
+    lattice, structure, _, reference = built(design, lattice)
     begin = None if start is None else _as_start(start, len(values), len(structure.mass))
     problem = Problem(values, begin, design, scene, lattice, structure)
     found = SEARCHES[method](problem, _as_options(options), threads, progress)
-    positions = _canonical_pose(_canonical_bows(found.positions, lattice, design), design, lattice, structure)
+    positions = _canonical_pose(_canonical_bows(found.positions, lattice, design), reference, structure)
     return _report(values, positions, found, scene, structure, method)
 
 
@@ -199,13 +208,12 @@ def _canonical_bows(positions: Floats, lattice: Lattice, design: Design) -> Floa
     return x
 
 
-def _canonical_pose(positions: Floats, design: Design, lattice: Lattice, structure: Structure) -> Floats:
+def _canonical_pose(positions: Floats, reference: Floats, structure: Structure) -> Floats:
     """Take out the rigid motions that cost no energy on flat ground: centre of mass over the origin, no mean yaw."""
-    reference = design.unloaded_nodes(lattice)[:, :2]
     centre = np.einsum("m,nmc->nc", structure.mass, positions)[:, :2] / structure.mass.sum()
     x = positions.copy()
     x[:, :, :2] -= centre[:, None, :]
-    nodes = x[:, : lattice.n_nodes, :2]
+    nodes = x[:, : len(reference), :2]
     cross = (reference[:, 0] * nodes[:, :, 1] - reference[:, 1] * nodes[:, :, 0]).sum(axis=1)
     along = (reference * nodes).sum(axis=(1, 2))
     yaw = np.arctan2(cross, along)

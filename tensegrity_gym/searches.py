@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ from tensegrity_gym.types import Floats, Structure
 IMPERFECTION = 1e-5
 #: Residual force per mass at which Newton's equilibria count as found, over the Euler load of a bar.
 TOLERANCE = 1e-8
+#: Up to so many equilibria Newton solves one after another, without lanes: eight at once cost as much as some alone.
+ALONE = 2
 #: Fictitious masses of relaxation over the sum of the stiffnesses at them; 1/2 is the limit of linear stability.
 MASS_MARGIN = 0.55
 
@@ -45,6 +48,22 @@ class SearchOptions:
     """Conjugate gradients: parabolas per line search."""
     damping: str = "viscous"
     """Relaxation: "viscous" or "kinetic"."""
+
+
+class Built(NamedTuple):
+    """What depends on design and lattice alone; shared between searches, so never written to."""
+
+    lattice: Lattice  #: whose cached arrays are there already
+    structure: Structure  #: the lattice built to the design
+    start: Floats  #: :func:`start_positions` [m], shape (n_masses, 3)
+    reference: Floats  #: the unloaded nodes seen from above, which tell yaw [m], shape (n_nodes, 2)
+
+
+@lru_cache(maxsize=32)
+def built(design: Design, lattice: Lattice) -> Built:
+    """Structure and start of a lattice, computed once: for a single equilibrium they take as long as the search."""
+    start = start_positions(design, lattice)
+    return Built(lattice, design.structure(lattice), start, np.ascontiguousarray(design.unloaded_nodes(lattice)[:, :2]))
 
 
 class Problem(NamedTuple):
@@ -71,7 +90,7 @@ class Problem(NamedTuple):
         """Where the search starts [m], shape (n, n_masses, 3), a fresh array."""
         if self.start is not None:
             return np.array(self.start, dtype=np.float64, order="C")
-        return np.repeat(start_positions(self.design, self.lattice)[None], len(self.stretches), axis=0)
+        return np.repeat(built(self.design, self.lattice).start[None], len(self.stretches), axis=0)
 
 
 class Found(NamedTuple):
@@ -147,13 +166,16 @@ def newton_search(problem: Problem, options: SearchOptions, threads: int | None,
         least_pivot=np.zeros(n),
     )
 
+    count = 1 if n <= ALONE else lane_count(np.float64)
+
     def work(first: int, last: int, counter: np.ndarray) -> None:
-        lanes = newton_lanes(structure, pattern.n_slots)
+        lanes = newton_lanes(m, structure.n_axial_members, structure.actuator_length, pattern.n_slots, count)
+        kernel = without_lanes(lanes) if count == 1 else lanes
         newton_equilibria(
-            structure, pattern, gravity, dead_load, settings, problem.stretches, records, lanes, first, last, counter
+            structure, pattern, gravity, dead_load, settings, problem.stretches, records, lanes, kernel, first, last, counter
         )
 
-    run_shares(work, n, threads, lane_count(np.float64), progress)
+    run_shares(work, n, threads, count, progress)
     return Found(
         records.positions,
         records.forces,
@@ -166,29 +188,52 @@ def newton_search(problem: Problem, options: SearchOptions, threads: int | None,
     )
 
 
-def newton_lanes(structure: Structure, n_slots: int) -> NewtonLanes:
-    """Work arrays of one thread."""
-    count, n_masses = lane_count(np.float64), len(structure.mass)
-    members = structure.n_axial_members
+def newton_lanes(n_masses: int, members: int, unloaded_length: Floats, n_slots: int, count: int) -> NewtonLanes:
+    """Work arrays of one thread for ``count`` lattices at a time: as many as a vector has lanes, or one."""
+    actuators = len(unloaded_length)
+
+    def empty(*shape: int) -> np.ndarray:
+        return lanes_empty(shape) if count == lane_count(np.float64) else np.zeros((*shape, count))
+
     return NewtonLanes(
-        x=lanes_empty((n_masses, 3)),
-        anchor=lanes_empty((n_masses, 3)),
-        still=lanes_empty((n_masses, 3)),
-        f=lanes_empty((n_masses, 3)),
-        memory=lanes_empty((members,)),
-        d=lanes_empty((n_masses, 3)),
-        h=lanes_empty((n_slots, 9)),
-        actuator_length=lanes_empty((len(structure.actuators),)),
-        scalars=lanes_empty((N_SCALARS,)),
+        x=empty(n_masses, 3),
+        anchor=empty(n_masses, 3),
+        still=empty(n_masses, 3),
+        f=empty(n_masses, 3),
+        memory=empty(members),
+        d=empty(n_masses, 3),
+        h=empty(n_slots, 9),
+        actuator_length=empty(actuators),
+        unloaded_length=unloaded_length,
+        scalars=empty(N_SCALARS),
         case=np.zeros(count, dtype=np.int64),
         iterations=np.zeros(count, dtype=np.int64),
         share=np.zeros(count),
         rounds=np.zeros(count, dtype=np.int64),
-        tension=lanes_empty((members,)),
-        anchor_tension=lanes_empty((members,)),
+        tension=empty(members),
+        anchor_tension=empty(members),
         strayed=np.zeros(count, dtype=np.int64),
-        held=lanes_empty((n_masses,)),
+        held=empty(n_masses),
     )
+
+
+def without_lanes(lanes: NewtonLanes) -> NewtonLanes:
+    """The work arrays of a single lane, seen without their lane axis."""
+    of_lattice = (
+        "x",
+        "anchor",
+        "still",
+        "f",
+        "memory",
+        "d",
+        "h",
+        "actuator_length",
+        "scalars",
+        "tension",
+        "anchor_tension",
+        "held",
+    )
+    return lanes._replace(**{name: getattr(lanes, name).reshape(getattr(lanes, name).shape[:-1]) for name in of_lattice})
 
 
 def cg_search(problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None) -> Found:

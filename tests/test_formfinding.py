@@ -201,10 +201,12 @@ def same_bits(a: Equilibria, rows_a: list[int], b: Equilibria, rows_b: list[int]
 
 
 def test_an_equilibrium_does_not_depend_on_its_batch() -> None:
-    """Bit for bit: alone, in another order, split over two threads."""
+    """Bit for bit: alone or a pair, which kernels solve without lanes, in another order, split over two threads."""
     whole = sample()
     alone = form_find(SAMPLE[3], threads=1)
     same_bits(alone, [0], whole, [3])
+    pair = form_find(SAMPLE[[10, 0]], threads=1)
+    same_bits(pair, [0, 1], whole, [10, 0])
     rows = list(range(len(SAMPLE)))[::-1]
     same_bits(form_find(SAMPLE[::-1], threads=2), list(range(len(SAMPLE))), whole, rows)
 

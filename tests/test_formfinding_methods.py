@@ -295,10 +295,10 @@ def buckled_bar(shortening: float) -> tuple[float, float]:
     pattern = block_pattern(structure.cables, structure.actuators, structure.bars, 6)
     settings = NewtonSettings(0.1, 1.0, 1e-7, 500, 0.02, 1e-3, 0.0, 0.0, 1e9, 12, 1.0, 10)
     records = EquilibriumRecords(x, np.zeros((1, 6, 3)), np.zeros(1), np.zeros(1, np.int64), np.zeros(1, np.bool_), np.zeros(1))
-    lanes = newton_lanes(structure, pattern.n_slots)
+    lanes = newton_lanes(6, structure.n_axial_members, structure.actuator_length, pattern.n_slots, 8)
     count = np.zeros(1, np.int64)
     zero = np.zeros((6, 3))
-    newton_equilibria(structure, pattern, zero[0], zero, settings, np.ones((1, 1)), records, lanes, 0, 1, count)
+    newton_equilibria(structure, pattern, zero[0], zero, settings, np.ones((1, 1)), records, lanes, lanes, 0, 1, count)
     assert records.converged[0]
     found = records.positions[0]
     chord = np.linalg.norm(found[1] - found[0])

@@ -5,7 +5,7 @@ The symbolic work is done before, once per topology (``elimination.py``): here i
 
 from __future__ import annotations
 
-from tensegrity_gym.core.blocks import load_block, subtract_block_plain
+from tensegrity_gym.core.blocks import load_block, multiply_transposed, subtract_block_plain
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import load, select, splat, sqrt, store
 
@@ -48,22 +48,6 @@ def _divide_rows(h, slot, r0, l10, r1, l20, l21, r2):
 
 
 @jit
-def _multiply_transposed(a, b):
-    """a b^T of two blocks."""
-    return (
-        a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
-        a[0] * b[3] + a[1] * b[4] + a[2] * b[5],
-        a[0] * b[6] + a[1] * b[7] + a[2] * b[8],
-        a[3] * b[0] + a[4] * b[1] + a[5] * b[2],
-        a[3] * b[3] + a[4] * b[4] + a[5] * b[5],
-        a[3] * b[6] + a[4] * b[7] + a[5] * b[8],
-        a[6] * b[0] + a[7] * b[1] + a[8] * b[2],
-        a[6] * b[3] + a[7] * b[4] + a[8] * b[5],
-        a[6] * b[6] + a[7] * b[7] + a[8] * b[8],
-    )
-
-
-@jit
 def factorise(pattern, h, floor):
     """Cholesky factor of h in place. Returns each lane's smallest pivot [N/m]; at or below ``floor`` the factor is void."""
     worst = splat(1e300, load(h, 0, 0))
@@ -77,7 +61,7 @@ def factorise(pattern, h, floor):
             _divide_rows(h, slot, r0, l10, r1, l20, l21, r2)
             left = load_block(h, slot)
             for other in range(pattern.starts[k], slot + 1):
-                subtract_block_plain(h, pattern.targets[update], _multiply_transposed(left, load_block(h, other)))
+                subtract_block_plain(h, pattern.targets[update], multiply_transposed(left, load_block(h, other)))
                 update += 1
     return worst
 

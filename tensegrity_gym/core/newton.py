@@ -1,4 +1,4 @@
-"""Newton for equilibria on the ground, a batch at a time: mixed steps, sparse Cholesky, active set for z >= 0.
+"""Newton for minima of any energy on the half-space z >= 0, a batch at a time: mixed steps, sparse Cholesky, active set.
 
 Each lane is a state machine of its own. It follows its load path from the unloaded lattice (all stretches 1) to its target
 stretches on a soft ground (a one-sided quadratic penalty); then it polishes on the rigid ground: the masses that sank are held
@@ -21,8 +21,7 @@ from tensegrity_gym.core.cholesky import factorise, solve
 from tensegrity_gym.core.forces import dot
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import load, load1, select, splat, sqrt, store, store1
-from tensegrity_gym.core.statics import Statics, static_energy, static_forces
-from tensegrity_gym.core.tangent import axial_tensions, lattice_tangent
+from tensegrity_gym.core.statics import Statics, predict_tensions, static_energy, static_forces, static_tangent
 
 
 class NewtonSettings(NamedTuple):
@@ -54,7 +53,10 @@ class EquilibriumRecords(NamedTuple):
 
 
 class NewtonLanes(NamedTuple):
-    """Work arrays of one thread."""
+    """Work arrays of one thread.
+
+    Kernels take them as they are, or a single lattice's without their lane axis: the same numbers, an eighth of the work.
+    """
 
     x: np.ndarray  #: positions [m], shape (n_masses, 3, lanes)
     anchor: np.ndarray  #: the last positions of falling energy, shape (n_masses, 3, lanes)
@@ -64,6 +66,7 @@ class NewtonLanes(NamedTuple):
     d: np.ndarray  #: step [m], shape (n_masses, 3, lanes)
     h: np.ndarray  #: tangent, then its factor [N/m], shape (n_slots, 9, lanes)
     actuator_length: np.ndarray  #: natural lengths [m], shape (n_actuators, lanes)
+    unloaded_length: np.ndarray  #: natural lengths at stretch 1 [m], shape (n_actuators,)
     scalars: np.ndarray  #: rows named below, shape (N_SCALARS, lanes)
     case: np.ndarray  #: which equilibrium each lane works on, -1 for none, shape (lanes,)
     iterations: np.ndarray  #: factorisations taken for it, shape (lanes,)
@@ -81,12 +84,11 @@ FIXED = 1e15  #: added to the tangent of a coordinate held by the ground [N/m]
 
 
 @jit(forceinline=False)
-def newton_direction(structure, pattern, settings, lanes):
+def newton_direction(pattern, settings, lanes):
     """Solve (H + mu I) d = f on the free coordinates; sets PIVOT, SLOPE = f . d and CUT, which keeps d to the trust length."""
-    lattice_tangent(structure, pattern, lanes.actuator_length, lanes.x, lanes.h, lanes.tension)
     shift = load1(lanes.scalars, SHIFT)
     zero = shift * 0.0
-    for i in range(structure.mass.shape[0]):
+    for i in range(lanes.x.shape[0]):
         held = load1(lanes.held, i) > 0.0
         below = select(load(lanes.x, i, 2) < 0.0, shift + settings.soft_ground, shift)
         store(lanes.h, i, 0, load(lanes.h, i, 0) + shift)
@@ -98,7 +100,7 @@ def newton_direction(structure, pattern, settings, lanes):
     store1(lanes.scalars, PIVOT, factorise(pattern, lanes.h, 0.0))
     solve(pattern, lanes.h, lanes.d)
     slope, longest = zero, zero
-    for i in range(structure.mass.shape[0]):
+    for i in range(lanes.x.shape[0]):
         dx, dy = load(lanes.d, i, 0), load(lanes.d, i, 1)
         dz = select(load1(lanes.held, i) > 0.0, zero, load(lanes.d, i, 2))
         store(lanes.d, i, 2, dz)
@@ -112,19 +114,19 @@ def newton_direction(structure, pattern, settings, lanes):
 
 
 @jit(forceinline=False)
-def step(structure, settings, lanes):
-    """x += CUT d, and the tensions that the linearised step predicts; nothing where the factor was void."""
+def cut_step(lanes):
+    """d *= CUT, and zero where the factor was void."""
     cut = load1(lanes.scalars, CUT)
     cut = select((load1(lanes.scalars, PIVOT) > 0.0) & (load1(lanes.scalars, SLOPE) >= 0.0), cut, cut * 0.0)
-    for i in range(structure.mass.shape[0]):
+    for i in range(lanes.x.shape[0]):
         for c in range(3):
             store(lanes.d, i, c, select(cut > 0.0, cut * load(lanes.d, i, c), cut * 0.0))
-    axial_tensions(structure, lanes.actuator_length, lanes.x, lanes.d, lanes.tension)
-    for k in range(structure.bars.shape[0] * (structure.bars.shape[1] - 1)):
-        pull = load1(lanes.tension, k)
-        most = splat(-settings.most_compression, pull)
-        store1(lanes.tension, k, select(pull > most, pull, most))
-    for i in range(structure.mass.shape[0]):
+
+
+@jit(forceinline=False)
+def take_step(lanes):
+    """x += d."""
+    for i in range(lanes.x.shape[0]):
         for c in range(3):
             store(lanes.x, i, c, load(lanes.x, i, c) + load(lanes.d, i, c))
 
@@ -153,11 +155,11 @@ def go_back(lanes, lane):
 
 
 @jit(forceinline=False)
-def set_load(structure, lanes, lane, stretches, progress):
+def set_load(lanes, lane, stretches, progress):
     """Natural lengths of a lane's actuated cables at ``progress`` from unloaded (0) to the target stretches (1)."""
     for k in range(stretches.shape[0]):
         stretch = 1.0 + progress * (stretches[k] - 1.0)
-        lanes.actuator_length[k, lane] = stretch * structure.actuator_length[k]
+        lanes.actuator_length[k, lane] = stretch * lanes.unloaded_length[k]
 
 
 @jit(forceinline=False)
@@ -190,7 +192,7 @@ ITERATE, MOVED, FOUND, GIVEN_UP = 0, 1, 2, 3
 
 
 @jit(forceinline=False)
-def next_stage(structure, settings, lanes, lane, stretches):
+def next_stage(settings, lanes, lane, stretches):
     """Advance a lane's load or ground if its residual allows; says what to do with the lane."""
     residual = lanes.scalars[RESIDUAL, lane]
     if lanes.iterations[lane] >= settings.max_iterations or not residual < 1e300:
@@ -199,7 +201,7 @@ def next_stage(structure, settings, lanes, lane, stretches):
         if residual > settings.path_tolerance:
             return ITERATE
         lanes.share[lane] = min(1.0, lanes.share[lane] + load_increment(stretches, settings))
-        set_load(structure, lanes, lane, stretches, lanes.share[lane])
+        set_load(lanes, lane, stretches, lanes.share[lane])
         return MOVED
     if residual > (settings.path_tolerance if lanes.rounds[lane] == 0 else settings.tolerance):
         return ITERATE
@@ -211,18 +213,13 @@ def next_stage(structure, settings, lanes, lane, stretches):
 
 
 @jit
-def find_equilibria(structure, pattern, gravity, load_forces, settings, stretches, records, lanes, first, last, progress):
-    """Equilibria ``first`` to ``last`` of ``records`` for ``stretches`` (n, n_actuators) in one thread's lanes."""
-    statics = Statics(
-        structure,
-        gravity,
-        load_forces,
-        lanes.actuator_length,
-        lanes.still,
-        lanes.memory,
-        lanes.held,
-        settings.soft_ground,
-    )
+def find_minima(
+    energy, forces, tangent, predict, problem, pattern, settings, stretches, records, lanes, work, first, last, progress
+):
+    """Minima ``first`` to ``last`` of ``records`` for ``stretches`` (n, n_actuators) in one thread's lanes.
+
+    ``work`` is ``lanes``, or of a single lane the same memory without its axis: kernels then compute one lattice only.
+    """
     count = lanes.x.shape[2]
     case = lanes.case
     queue = first
@@ -230,18 +227,18 @@ def find_equilibria(structure, pattern, gravity, load_forces, settings, stretche
     for lane in range(count):
         case[lane] = -1
         source = min(first + lane, last - 1)
-        _load_case(structure, settings, lanes, lane, stretches[source], records.positions[source])
+        _load_case(settings, lanes, lane, stretches[source], records.positions[source])
         if queue < last:
             case[lane] = queue
             queue += 1
             running += 1
     while running > 0:
-        evaluate(statics, lanes)
+        evaluate(energy, forces, problem, work)
         moved = False
         for lane in range(count):
             if case[lane] < 0:
                 continue
-            stage = next_stage(structure, settings, lanes, lane, stretches[case[lane]])
+            stage = next_stage(settings, lanes, lane, stretches[case[lane]])
             if stage == ITERATE:
                 moved = _judge(settings, lanes, lane) or moved
                 continue
@@ -256,27 +253,30 @@ def find_equilibria(structure, pattern, gravity, load_forces, settings, stretche
                     case[lane] = queue
                     queue += 1
                     running += 1
-                    _load_case(structure, settings, lanes, lane, stretches[case[lane]], records.positions[case[lane]])
+                    _load_case(settings, lanes, lane, stretches[case[lane]], records.positions[case[lane]])
         if moved:
-            evaluate(statics, lanes)
+            evaluate(energy, forces, problem, work)
             for lane in range(count):
                 if lanes.strayed[lane] < 0:
                     set_anchor(lanes, lane)
-        newton_direction(structure, pattern, settings, lanes)
-        step(structure, settings, lanes)
+        tangent(problem, pattern, work.x, work.tension, work.h)
+        newton_direction(pattern, settings, work)
+        cut_step(work)
+        predict(problem, settings.most_compression, work.x, work.d, work.tension)
+        take_step(work)
         for lane in range(count):
             lanes.iterations[lane] += 1
 
 
-@jit(forceinline=False)
-def evaluate(statics, lanes):
+@jit  # inlined: numba does not cache what hands functions on to calls that stay calls
+def evaluate(energy, forces, problem, lanes):
     """Fill f, set RESIDUAL and ENERGY."""
-    store1(lanes.scalars, RESIDUAL, static_forces(statics, lanes.x, lanes.f))
-    store1(lanes.scalars, ENERGY, static_energy(statics, lanes.x))
+    store1(lanes.scalars, RESIDUAL, forces(problem, lanes.x, lanes.f))
+    store1(lanes.scalars, ENERGY, energy(problem, lanes.x))
 
 
 @jit(forceinline=False)
-def _load_case(structure, settings, lanes, lane, stretches, positions):
+def _load_case(settings, lanes, lane, stretches, positions):
     for i in range(lanes.x.shape[0]):
         for c in range(3):
             lanes.x[i, c, lane] = positions[i, c]
@@ -284,7 +284,7 @@ def _load_case(structure, settings, lanes, lane, stretches, positions):
     lanes.iterations[lane] = 0
     lanes.rounds[lane] = 0
     lanes.share[lane] = load_increment(stretches, settings) if settings.unload > 0.0 else 1.0
-    set_load(structure, lanes, lane, stretches, lanes.share[lane])
+    set_load(lanes, lane, stretches, lanes.share[lane])
     lanes.scalars[SHIFT, lane] = settings.least_shift
     for k in range(lanes.tension.shape[0]):
         lanes.tension[k, lane] = 0.0
@@ -328,7 +328,38 @@ def _judge(settings, lanes, lane):
     return True
 
 
+@jit
+def find_equilibria(structure, pattern, gravity, dead_load, settings, stretches, records, lanes, work, first, last, progress):
+    """:func:`find_minima` of lattices on the ground."""
+    statics = Statics(
+        structure,
+        gravity,
+        dead_load,
+        work.actuator_length,
+        work.still,
+        work.memory,
+        work.held,
+        settings.soft_ground,
+    )
+    find_minima(
+        static_energy,
+        static_forces,
+        static_tangent,
+        predict_tensions,
+        statics,
+        pattern,
+        settings,
+        stretches,
+        records,
+        lanes,
+        work,
+        first,
+        last,
+        progress,
+    )
+
+
 @jit(cache=True)
-def newton_equilibria(structure, pattern, gravity, load_forces, settings, stretches, records, lanes, first, last, progress):
+def newton_equilibria(structure, pattern, gravity, dead_load, settings, stretches, records, lanes, work, first, last, progress):
     """:func:`find_equilibria`, compiled once and cached."""
-    find_equilibria(structure, pattern, gravity, load_forces, settings, stretches, records, lanes, first, last, progress)
+    find_equilibria(structure, pattern, gravity, dead_load, settings, stretches, records, lanes, work, first, last, progress)

@@ -13,7 +13,8 @@ import numpy as np
 from tensegrity_gym.core.energy import actuator_energy, bar_energy, cable_energy, gravitational_energy
 from tensegrity_gym.core.forces import dot, lattice_forces
 from tensegrity_gym.core.jit import jit
-from tensegrity_gym.core.lanes import fma, load, load1, select, sqrt, store
+from tensegrity_gym.core.lanes import fma, load, load1, select, splat, sqrt, store, store1
+from tensegrity_gym.core.tangent import axial_tensions, lattice_tangent
 from tensegrity_gym.types import Structure
 
 
@@ -76,6 +77,23 @@ def free_forces(statics, x, f):
         fz = load(f, i, 2)
         store(f, i, 2, select(load1(statics.held, i) > 0.0, fz * 0.0, fz))
     return worst
+
+
+@jit(forceinline=False)
+def static_tangent(statics, pattern, x, tensions, h):
+    """Fill h with the members' tangent stiffness [N/m], its geometric part made with ``tensions`` [N]."""
+    lattice_tangent(statics.structure, pattern, statics.actuator_length, x, h, tensions)
+
+
+@jit(forceinline=False)
+def predict_tensions(statics, most_compression, x, d, tensions):
+    """Tensions [N] of the axial members that the step d, linearised at x, leads to, bar segments at most ``most_compression``."""
+    structure = statics.structure
+    axial_tensions(structure, statics.actuator_length, x, d, tensions)
+    for k in range(structure.bars.shape[0] * (structure.bars.shape[1] - 1)):
+        pull = load1(tensions, k)
+        most = splat(-most_compression, pull)
+        store1(tensions, k, select(pull > most, pull, most))
 
 
 @jit(forceinline=False)

@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from tensegrity_gym.core.blocks import add, add_block, outer, scaled_identity, subtract, subtract_block, transpose
+from tensegrity_gym.core.blocks import (
+    add,
+    add_block,
+    multiply,
+    outer,
+    scale,
+    scaled_identity,
+    subtract,
+    subtract_block,
+    transpose,
+)
 from tensegrity_gym.core.forces import between, dot
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import load, load1, select, splat, sqrt, store, store1
@@ -77,38 +87,6 @@ def hinge_blocks(kappa, u, inverse_u, v, inverse_v):
     bb = add(bb, add(add(skew_v, transpose(skew_v)), scale(scale_v * c, project_v)))
     ab = add(ab, scale(first * inverse_u * inverse_v, multiply(project_u, project_v)))
     return aa, ab, bb
-
-
-@jit
-def scale(factor, a):
-    """factor * a."""
-    return (
-        factor * a[0],
-        factor * a[1],
-        factor * a[2],
-        factor * a[3],
-        factor * a[4],
-        factor * a[5],
-        factor * a[6],
-        factor * a[7],
-        factor * a[8],
-    )
-
-
-@jit
-def multiply(a, b):
-    """a b."""
-    return (
-        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
-        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
-        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
-        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
-        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
-        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
-        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
-        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
-        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
-    )
 
 
 @jit
