@@ -168,7 +168,7 @@ def _plans(stages: Stages, config: DemoConfig, data: HopData, held_out: HopData,
 def _policy(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData, budgets: list[int]) -> None:
     from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
 
-    settings = PolicyConfig(calls=config.hops, seed=config.seed, gradient_steps=config.gradient_steps)
+    settings = PolicyConfig(calls=config.hops, seed=config.seed, updates=config.gradient_steps)
     path = stages.folder / "policy.safetensors"
 
     def work() -> Results:

@@ -19,25 +19,35 @@ from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training.planner import Prediction
 
-FORMAT = "tensegrity_gym.actor/1"
+FORMAT = "tensegrity_gym.actor/2"
+
+
+#: How an actor's outputs are brought into [-1, 1].
+SQUASHES = {"tanh": torch.tanh, "clip": lambda x: torch.clamp(x, -1, 1)}
 
 
 class ActorPolicy:
-    """Deterministic actor: observation / ``scale`` through a ReLU MLP and tanh, then onto the range of stretches."""
+    """Deterministic actor: observation / ``scale`` through a ReLU MLP, into [-1, 1], then onto the range of stretches."""
 
-    def __init__(self, layers: nn.Sequential, scale: float) -> None:
+    def __init__(self, layers: nn.Sequential, scale: float, squash: str = "tanh") -> None:
         self.layers = layers.eval()
-        self.scale = float(scale)
+        self.scale, self.squash = float(scale), squash
 
     @classmethod
-    def from_sac(cls, model: Any, scale: float) -> ActorPolicy:
-        """Copy the actor of a stable-baselines3 SAC trained on observations / ``scale`` and actions in [-1, 1]."""
-        actor = model.policy.actor
-        found = [layer for layer in [*actor.latent_pi, actor.mu] if isinstance(layer, nn.Linear)]
+    def from_model(cls, model: Any, scale: float) -> ActorPolicy:
+        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on observations / ``scale``."""
+        policy = model.policy
+        if hasattr(policy, "mlp_extractor"):  # PPO's mean action is cut off, not squashed
+            modules, squash = [*policy.mlp_extractor.policy_net, policy.action_net], "clip"
+        elif hasattr(policy.actor, "latent_pi"):  # SAC
+            modules, squash = [*policy.actor.latent_pi, policy.actor.mu], "tanh"
+        else:  # TD3
+            modules, squash = list(policy.actor.mu), "tanh"
+        found = [layer for layer in modules if isinstance(layer, nn.Linear)]
         copy = _mlp([found[0].in_features, *(layer.out_features for layer in found)])
         for mine, theirs in zip(list(copy)[::2], found, strict=True):
             mine.load_state_dict(theirs.state_dict())
-        return cls(copy, scale)
+        return cls(copy, scale, squash)
 
     @torch.no_grad()
     def predict(
@@ -49,7 +59,8 @@ class ActorPolicy:
         if batch.ndim != 2 or batch.shape[1] != width or not np.isfinite(batch).all():
             raise InvalidParameterError(f"observation: expected finite numbers ({width},) or (n, {width}), got {observation!r}")
         low, high = STRETCH_RANGE
-        share = (torch.tanh(self.layers(torch.from_numpy(batch / self.scale))).numpy().astype(np.float64) + 1) / 2
+        action = SQUASHES[self.squash](self.layers(torch.from_numpy(batch / np.float32(self.scale))))
+        share = (action.numpy().astype(np.float64) + 1) / 2
         stretches = np.clip(low + (high - low) * share, low, high)
         return (stretches[0] if np.ndim(observation) == 1 else stretches), state
 
@@ -64,6 +75,7 @@ class ActorPolicy:
             "format": FORMAT,
             "model_version": MODEL_VERSION,
             "scale": self.scale,
+            "squash": self.squash,
             "sha256": hashlib.sha256(content).hexdigest(),
         }
         write_json(path.with_suffix(".json"), card | fixed)
@@ -86,7 +98,9 @@ class ActorPolicy:
             weights = [state[name] for name in sorted(state, key=lambda n: int(n.split(".")[0])) if name.endswith("weight")]
             layers = _mlp([weights[0].shape[1], *(w.shape[0] for w in weights)])
             layers.load_state_dict(state)
-            return cls(layers, card["scale"])
+            if card["squash"] not in SQUASHES:
+                raise ValueError(f"its card says squash {card['squash']!r}")
+            return cls(layers, card["scale"], card["squash"])
         except (OSError, ValueError, KeyError, IndexError, TypeError, RuntimeError, SafetensorError) as error:
             raise DataFileError(f"{path}: expected a whole actor checkpoint ({error}); train it again") from error
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -55,12 +55,13 @@ class BatchedHopVecEnv(DummyVecEnv):
 
     Targets, seeds, spaces and observations are the envs' own, rewards come from the same function that they call; only
     ``simulate`` is called once for all of them. Infos hold ``landing`` (2,) [m], ``error`` [m] and ``status``.
+    ``fidelity``: as the env's.
     """
 
-    def __init__(self, scene: Scene, scale: float, envs: int) -> None:
+    def __init__(self, scene: Scene, scale: float, envs: int, fidelity: str | Mapping[str, Any] = "paper") -> None:
         makers: Sequence[Callable[[], gym.Env]] = [lambda: make_env(scene, scale)] * envs
         super().__init__(list(makers))
-        self.scene = scene
+        self.scene, self.levers = scene, task.check_fidelity(fidelity)
         #: Hops simulated since the envs were made.
         self.simulator_calls = 0
 
@@ -69,7 +70,7 @@ class BatchedHopVecEnv(DummyVecEnv):
         plain: list[Any] = self.envs
         low, high = tensegrity_gym.STRETCH_RANGE  # float32 cannot hold them: cut the overshoot off, as the env does
         stretches = np.stack([env.action(action) for env, action in zip(plain, self.actions, strict=True)]).astype(np.float64)
-        hop = simulate(np.clip(stretches, low, high), scene=self.scene)
+        hop = simulate(np.clip(stretches, low, high), scene=self.scene, **self.levers)
         self.simulator_calls += len(stretches)
         targets = np.stack([info["target"] for info in self.reset_infos])
         rewards = task.reward(hop.landing, targets, hop.status, task.reach(self.scene))

@@ -1,4 +1,4 @@
-"""Train a policy with stable-baselines3 through ``gym.make("TensegrityHop-v0")``."""
+"""Train a policy with stable-baselines3 on the registered env."""
 
 from __future__ import annotations
 
@@ -10,127 +10,165 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.vec_env import VecMonitor
 from tqdm import tqdm
 
 import tensegrity_gym  # noqa: F401  registers the env
 from surrogate.model import one_thread
+from surrogate.storage import hash_of
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.task import reach
+from training import checkpoint
+from training.algorithms import build, env_count, hyperparameters
 from training.policies import ActorPolicy
 from training.sb3_vec_env import BatchedHopVecEnv
+
+#: Added to the seed of the envs that a policy is evaluated in while it trains.
+EVALUATION_SEED = 2_000_003
 
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """SAC on one-step episodes: nothing follows a hop, so gamma is 0 and the critic learns the reward itself.
+    """A policy on one-step episodes."""
 
-    Automatic entropy would drown a reward of this size in exploration; a small constant does not.
-    """
-
+    algorithm: str = "sac"
+    """sac, td3 or ppo; its hyper-parameters are in training/hyperparameters."""
     calls: int = 256
     """Hops that training may simulate."""
     seed: int = 0
     """Seed of weights, exploration and targets."""
-    learning_rate: float = 1e-3
-    """Adam's learning rate of actor and critics."""
-    ent_coef: float = 0.001
-    """Weight of the entropy in the objective."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of actor and critics."""
-    batch_size: int = 64
-    """Hops per gradient step."""
-    gradient_steps: int = 8
-    """Gradient steps per hop."""
-    warmup: float = 0.125
-    """Share of the hops with random stretches before learning starts."""
+    updates: int | None = None
+    """Gradient steps per hop of sac and td3; None: as the hyper-parameters say."""
+    hyperparameters: Path | None = None
+    """TOML file in place of the committed one."""
     envs: int = 16
     """Envs whose hops are simulated together; halved until it divides ``calls``, so that no hop is over budget."""
+    fidelity: str = "paper"
+    """Model of the hop: paper, or single (precision)."""
+    checkpoint_every: int = 512
+    """Hops between two checkpoints, where there is a file to keep them in."""
+    evaluate_every: int = 0
+    """Hops between two evaluations on 32 episodes of their own, which count as no training hops; 0: none."""
 
 
 @dataclass(frozen=True)
 class PolicyCommand(PolicyConfig):
-    """Train a SAC policy on the env and keep its actor."""
+    """Train a policy on the env and keep its actor; run again after a kill, it goes on where it was."""
 
     out: Path = Path("runs/policy.safetensors")
-    """Checkpoint to write; its card goes beside it as .json."""
+    """Checkpoint to write; its card goes beside it as .json, and the state of an unfinished training as .training."""
     scene: str = "earth"
     """Scene preset."""
     landing: str = "rest"
     """Where a landing is read: rest or touchdown."""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard."""
 
 
 class _Watch(BaseCallback):
-    """Moves the progress bar and copies the actor whenever a budget of simulator calls is spent."""
+    """Moves the progress bar, copies the actor whenever a budget of simulator calls is spent, and writes checkpoints."""
 
-    def __init__(self, budgets: Sequence[int], scale: float, bar: tqdm) -> None:
+    def __init__(self, config: PolicyConfig, budgets: Sequence[int], scale: float, bar: tqdm, path: Path | None, settings: str):
         super().__init__()
-        self.budgets, self.scale, self.bar = sorted(budgets), scale, bar
+        self.config, self.budgets, self.scale, self.bar = config, sorted(budgets), scale, bar
+        self.path, self.settings, self.written = path, settings, 0
         self.snapshots: dict[int, ActorPolicy] = {}
 
     def _on_step(self) -> bool:
         self.bar.update(self.num_timesteps - self.bar.n)
-        error = np.mean([info["error"] for info in self.locals["infos"]])
-        self.bar.set_postfix(error=f"{error:.3f} m", refresh=False)
+        errors = [info["error"] for info in self.locals["infos"]]
+        self.logger.record_mean("rollout/landing_error", float(np.mean(errors)))
+        self.bar.set_postfix(error=f"{np.mean(errors):.3f} m", refresh=False)
         return True
 
     def _on_rollout_start(self) -> None:
         self.keep()  # training on the last hops is over when the next are collected
+        done = self.model.num_timesteps
+        if self.path is not None and done - self.written >= self.config.checkpoint_every:
+            actors = {budget: actor.layers.state_dict() for budget, actor in self.snapshots.items()}
+            checkpoint.save(self.path, self.model, self.settings, actors)
+            self.written = done
 
     def keep(self) -> None:
         """Copy the actor if a budget is spent that has no copy yet."""
         for budget in self.budgets:
-            if self.num_timesteps >= budget and budget not in self.snapshots:
-                self.snapshots[budget] = ActorPolicy.from_sac(self.model, self.scale)
+            if self.model.num_timesteps >= budget and budget not in self.snapshots:
+                self.snapshots[budget] = ActorPolicy.from_model(self.model, self.scale)
+
+    def resume(self, model: Any, actors: dict[int, Any]) -> None:
+        """Go on with the actors of a checkpoint."""
+        self.written = model.num_timesteps
+        self.bar.update(model.num_timesteps)
+        for budget, weights in actors.items():
+            self.snapshots[budget] = ActorPolicy.from_model(model, self.scale)
+            self.snapshots[budget].layers.load_state_dict(weights)
 
 
 @one_thread()
 def train_policy(
-    scene: Scene, config: PolicyConfig, *, budgets: Sequence[int] = (), progress: bool = True
+    scene: Scene,
+    config: PolicyConfig,
+    *,
+    budgets: Sequence[int] = (),
+    progress: bool = True,
+    state: Path | None = None,
+    tensorboard: Path | None = None,
 ) -> tuple[dict[int, ActorPolicy], dict[str, Any]]:
-    """Train SAC for ``config.calls`` hops; returns actors as they were after each of ``budgets`` hops, and a card.
+    """Train for ``config.calls`` hops; returns actors as they were after each of ``budgets`` hops, and a card.
 
-    The last actor, after all the hops, is always among them.
+    The last actor, after all the hops, is always among them. ``state`` is a file from which a killed training goes on,
+    with the same bits; it is removed at the end.
     """
     if config.calls < 1 or any(not 0 < b <= config.calls for b in budgets):
         raise InvalidParameterError(
             f"calls and budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}"
         )
     started = time.perf_counter()
-    scale = reach(scene)
-    envs = config.envs
-    while config.calls % envs:
-        envs = (envs + 1) // 2
-    with contextlib.closing(BatchedHopVecEnv(scene, scale, envs)) as venv:
-        model = SAC(
-            "MlpPolicy",
-            venv,
-            gamma=0.0,
-            learning_rate=config.learning_rate,
-            ent_coef=config.ent_coef,
-            batch_size=config.batch_size,
-            gradient_steps=config.gradient_steps * envs,
-            learning_starts=max(int(config.warmup * config.calls), envs),
-            buffer_size=max(config.calls, envs),
-            policy_kwargs={"net_arch": list(config.hidden), "activation_fn": torch.nn.ReLU},
-            seed=config.seed,
-            device="cpu",
+    scale, envs = reach(scene), env_count(config.calls, config.envs)
+    values = hyperparameters(config.algorithm, config.hyperparameters)
+    if config.updates is not None and "updates" in values:
+        values |= {"updates": config.updates}
+    plain = asdict(config) | {"hyperparameters": values}
+    settings = hash_of({"config": plain, "scene": asdict(scene), "budgets": sorted(budgets)})
+    with contextlib.ExitStack() as stack:
+        hops = BatchedHopVecEnv(scene, scale, envs, config.fidelity)
+        venv = stack.enter_context(contextlib.closing(VecMonitor(hops)))
+        bar = stack.enter_context(
+            tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
         )
-        with tqdm(total=config.calls, unit="hop", desc="policy (SAC)", disable=not progress, mininterval=0.5) as bar:
-            watch = _Watch([*budgets, config.calls], scale, bar)
-            model.learn(config.calls, callback=watch)
-            watch.keep()
-        calls = venv.simulator_calls
-    card = {"algorithm": "SAC", "train": asdict(config), "scene": asdict(scene), "simulator_calls": calls}
+        model = build(config.algorithm, values, venv, config.calls, config.seed, tensorboard)
+        watch = _Watch(config, [*budgets, config.calls], scale, bar, state, settings)
+        before = 0
+        if state is not None and state.exists():
+            watch.resume(model, checkpoint.restore(state, model, venv, settings))
+            before = model.num_timesteps
+        callbacks: list[BaseCallback] = [watch]
+        if config.evaluate_every:
+            callbacks.append(_evaluation(stack, scene, scale, config))
+        model.learn(config.calls - before, callback=CallbackList(callbacks), reset_num_timesteps=before == 0)
+        watch.keep()
+        calls = before + hops.simulator_calls
+    if state is not None:
+        state.unlink(missing_ok=True)
+    card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": asdict(scene), "simulator_calls": calls}
     return watch.snapshots, card | {"seconds": time.perf_counter() - started}
+
+
+def _evaluation(stack: contextlib.ExitStack, scene: Scene, scale: float, config: PolicyConfig) -> EvalCallback:
+    venv = BatchedHopVecEnv(scene, scale, 16, config.fidelity)
+    venv.seed(config.seed + EVALUATION_SEED)
+    monitored = stack.enter_context(contextlib.closing(VecMonitor(venv)))
+    every = max(1, config.evaluate_every // env_count(config.calls, config.envs))
+    return EvalCallback(monitored, n_eval_episodes=32, eval_freq=every, verbose=0, warn=False)
 
 
 def main(config: PolicyCommand) -> None:
     """Entry of ``python -m training policy``."""
-    actors, card = train_policy(Scene.preset(config.scene, landing=config.landing), config)
-    card["train"] = {k: str(v) if isinstance(v, Path) else v for k, v in card["train"].items()}
+    plain = PolicyConfig(**{name: getattr(config, name) for name in PolicyConfig.__dataclass_fields__})
+    scene = Scene.preset(config.scene, landing=config.landing)
+    state = config.out.with_suffix(".training")
+    actors, card = train_policy(scene, plain, state=state, tensorboard=config.tensorboard)
     actors[config.calls].save(config.out, card)
-    print(f"{config.out}: SAC, {card['simulator_calls']} simulator calls in {card['seconds']:.1f} s")
+    print(f"{config.out}: {card['algorithm']}, {card['simulator_calls']} simulator calls in {card['seconds']:.1f} s")

@@ -1,0 +1,70 @@
+"""stable-baselines3's algorithms, set up for one-step episodes from the committed files of hyper-parameters."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecEnv
+
+from tensegrity_gym.errors import DataFileError, InvalidParameterError
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"sac": SAC, "td3": TD3, "ppo": PPO}
+FOLDER = Path(__file__).parent / "hyperparameters"
+
+
+def hyperparameters(algorithm: str, path: Path | None = None) -> dict[str, Any]:
+    """The committed hyper-parameters of an algorithm, or those in the TOML file ``path``."""
+    if algorithm not in ALGORITHMS:
+        raise InvalidParameterError(f"algorithm: expected one of {sorted(ALGORITHMS)}, got {algorithm!r}")
+    source = path or FOLDER / f"{algorithm}.toml"
+    committed = tomllib.loads((FOLDER / f"{algorithm}.toml").read_text(encoding="utf-8"))
+    try:
+        found = tomllib.loads(source.read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise DataFileError(f"expected a TOML file of hyper-parameters at {source}: {error}") from error
+    if set(found) != set(committed):
+        raise InvalidParameterError(f"{source}: expected the keys {sorted(committed)} of {algorithm}, got {sorted(found)}")
+    return found
+
+
+def env_count(calls: int, envs: int) -> int:
+    """The greatest number of envs, out of ``envs`` halved again and again, that divides ``calls``: no hop is over budget."""
+    while calls % envs:
+        envs = (envs + 1) // 2
+    return envs
+
+
+def build(algorithm: str, values: Mapping[str, Any], venv: VecEnv, calls: int, seed: int, tensorboard: Path | None) -> Any:
+    """The algorithm on ``venv`` for ``calls`` hops, which its envs must divide."""
+    envs = venv.num_envs
+    options = dict(values["model"]) | {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard and str(tensorboard)}
+    policy = {"net_arch": list(values["hidden"]), "activation_fn": torch.nn.ReLU}
+    if algorithm == "ppo":
+        steps = _divisor(calls // envs, max(1, values["rollout"] // envs))
+        rollout, parts = steps * envs, values["minibatches"]
+        policy["log_std_init"] = values["log_std_init"]
+        options |= {"n_steps": steps, "batch_size": max(2, rollout // parts if rollout % parts == 0 else rollout)}
+    else:
+        per_hop = min(values["updates"], values["max_updates"] / calls)
+        options |= {
+            "gradient_steps": max(1, round(per_hop * envs)),
+            "learning_starts": max(min(int(values["warmup"] * calls), values["most_warmup"]), envs),
+            "buffer_size": calls,
+        }
+    if "action_noise" in values:
+        size = venv.action_space.shape or ()
+        options["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, values["action_noise"]))
+    return ALGORITHMS[algorithm]("MlpPolicy", venv, policy_kwargs=policy, **options)
+
+
+def _divisor(number: int, most: int) -> int:
+    """The greatest divisor of ``number`` that is at most ``most``."""
+    return next(k for k in range(min(most, number), 0, -1) if number % k == 0)
