@@ -9,7 +9,7 @@ import pytest
 from test_forces import NONE, Case, case, core_forces, distance_from_slack, eight_of_one_structure
 
 from tensegrity_gym import Lattice
-from tensegrity_gym.elimination import lattice_pattern
+from tensegrity_gym.elimination import couplings, dissection, lattice_pattern, minimum_degree
 from tensegrity_gym.types import BlockPattern
 
 EPS = naive.EPS
@@ -136,3 +136,36 @@ def test_the_pattern_has_a_slot_for_every_coupling_and_the_count_of_updates() ->
     for k, column in enumerate(pattern.order):
         rows = pattern.rows[pattern.starts[k] - n : pattern.starts[k + 1] - n]
         assert (position[rows] > position[column]).all()
+
+
+@pytest.mark.parametrize(("size", "segments"), [((3, 2), 3), ((2, 4), 1), ((4, 3), 2)])
+def test_dissection_cuts_the_lattice_into_blocks_that_no_member_joins(size: tuple[int, int], segments: int) -> None:
+    """A partition; two parts touch only where the later one is a cut; and the sparse solution is the dense one's."""
+    lattice = Lattice(*size)
+    c = case(size, segments, 3e-3, seed=5)
+    parts = dissection(lattice, segments)
+    assert len(parts) > 1
+    where = {mass: k for k, part in enumerate(parts) for mass in part}
+    assert sorted(where) == list(range(len(c.x)))
+    assert sum(map(len, parts)) == len(c.x)
+    blocks = [k for k, part in enumerate(parts) if any(mass >= lattice.n_nodes for mass in part)]  # a cut is of nodes alone
+    pairs = couplings(c.structure.cables, c.structure.actuators, c.structure.bars)
+    joined = {(min(where[a], where[b]), max(where[a], where[b])) for a, b in pairs}
+    assert not {(k, m) for k, m in joined if k != m and m in blocks}
+    pattern = lattice_pattern(lattice, segments)
+    h = core_tangent(c, pattern)
+    h[: len(c.x), [0, 4, 8]] += 1e6
+    matrix, y = naive.dense_tangent(pattern, h), np.random.default_rng(0).normal(size=c.x.shape)
+    found, pivot = solved(pattern, h, y)
+    assert pivot > 0
+    np.testing.assert_allclose(found.ravel(), np.linalg.solve(matrix, y.ravel()), rtol=0, atol=1e-10 * np.abs(found).max())
+
+
+def test_dissection_updates_fewer_blocks_and_leaves_small_lattices_whole() -> None:
+    assert len(dissection(Lattice(2, 2), 3)) == 1
+    lattice = Lattice(4, 4)
+    cut = lattice_pattern(lattice, 3)
+    c = case((4, 4), 3, 0.0, seed=1)
+    _, columns = minimum_degree(len(c.x), couplings(c.structure.cables, c.structure.actuators, c.structure.bars))
+    whole = sum(len(column) * (len(column) + 1) // 2 for column in columns)
+    assert len(cut.targets) < 0.85 * whole
