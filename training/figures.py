@@ -29,7 +29,7 @@ def _style() -> AbstractContextManager[None]:
     return plt.rc_context(STYLE)  # type: ignore[arg-type]
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path) -> Path:
     """Write a PNG atomically and close the figure."""
     picture = io.BytesIO()
     figure.savefig(picture, format="png", bbox_inches="tight")
@@ -78,7 +78,7 @@ def energies(result: HopResult, path: Path) -> float:
                 )
         axes.set(xlabel="time since release [s]", ylabel="energy [J]", xlim=(0, times[-1]))
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-        _save(figure, path)
+        save(figure, path)
     return closure
 
 
@@ -95,7 +95,7 @@ def landing_map(data: HopData, path: Path) -> Path:
             ax.set(title=f"{title}, {len(data)} hops", xlabel="x [m]", ylabel="y [m]")
             ax.set_aspect("equal", adjustable="datalim")
         figure.colorbar(marks, ax=axes, label="λ1 − λ2 + λ3 − λ4", shrink=0.9)
-        return _save(figure, path)
+        return save(figure, path)
 
 
 def predicted_against_simulated(predicted: np.ndarray, held_out: HopData, path: Path) -> Path:
@@ -112,7 +112,7 @@ def predicted_against_simulated(predicted: np.ndarray, held_out: HopData, path: 
             error = np.sqrt(np.mean((predicted[known, k] - simulated[known, k]) ** 2)) if known.any() else float("nan")
             ax.set(title=f"{output.name.replace('_', ' ')}: RMSE {error:.3g} {output.unit}")
             ax.set(xlabel=f"simulated [{output.unit}]", ylabel=f"predicted [{output.unit}]")
-        return _save(figure, path)
+        return save(figure, path)
 
 
 def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
@@ -129,7 +129,7 @@ def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
             ax.title.set_fontsize(11)
         np.atleast_1d(axes)[0].set(ylabel="y [m]")
         np.atleast_1d(axes)[0].legend(loc="best", fontsize=9)
-        return _save(figure, path)
+        return save(figure, path)
 
 
 def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float, path: Path) -> Path:
@@ -157,4 +157,4 @@ def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float,
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("")
         axes.legend(loc="lower left")
-        return _save(figure, path)
+        return save(figure, path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -64,13 +65,17 @@ class BatchedHopVecEnv(DummyVecEnv):
         self.scene, self.levers = scene, task.check_fidelity(fidelity)
         #: Hops simulated since the envs were made.
         self.simulator_calls = 0
+        #: Wall time that simulating them took [s].
+        self.seconds = 0.0
 
     def step_wait(self) -> Any:
         """Simulate one hop per env; every episode ends, and every env is reset."""
         plain: list[Any] = self.envs
         low, high = tensegrity_gym.STRETCH_RANGE  # float32 cannot hold them: cut the overshoot off, as the env does
         stretches = np.stack([env.action(action) for env, action in zip(plain, self.actions, strict=True)]).astype(np.float64)
+        started = time.perf_counter()
         hop = simulate(np.clip(stretches, low, high), scene=self.scene, **self.levers)
+        self.seconds += time.perf_counter() - started
         self.simulator_calls += len(stretches)
         targets = np.stack([info["target"] for info in self.reset_infos])
         rewards = task.reward(hop.landing, targets, hop.status, task.reach(self.scene))

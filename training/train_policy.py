@@ -153,7 +153,7 @@ def train_policy(
     if state is not None:
         state.unlink(missing_ok=True)
     card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": asdict(scene), "simulator_calls": calls}
-    return watch.snapshots, card | {"seconds": time.perf_counter() - started}
+    return watch.snapshots, card | {"seconds": time.perf_counter() - started, "simulating_seconds": hops.seconds}
 
 
 def _evaluation(stack: contextlib.ExitStack, scene: Scene, scale: float, config: PolicyConfig) -> EvalCallback:

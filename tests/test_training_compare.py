@@ -1,0 +1,133 @@
+"""The comparison: its statistics, its targets, and the whole of it from end to end, killed and resumed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tensegrity_gym import Scene, form_find, simulate
+from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from training.compare import report, run
+from training.compare import targets as registered
+from training.compare.config import CompareConfig
+from training.compare.hops import PERTURBATION, Hops, repeated
+from training.compare.results import Outcome
+from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
+
+QUICK = Scene(duration=0.05)
+
+
+def test_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:
+    assert interquartile_mean(np.array([-1e6, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1e9])) == pytest.approx(3.5)
+
+
+def test_interval_covers_the_truth_as_often_as_it_says() -> None:
+    """Errors of 10 seeds on 8 targets of different difficulty: the interval must hold the mean of many seeds."""
+    rng = np.random.default_rng(0)
+    difficulty = np.linspace(1, 2, 8)
+
+    def run_seeds(seeds: int) -> np.ndarray:
+        return difficulty + rng.normal(0, 0.3, (seeds, 8))
+
+    truth = interquartile_mean(run_seeds(200_000))
+    held = [low <= truth <= high for low, high in (interval(run_seeds(10), draws=400) for _ in range(200))]
+    assert 0.85 <= np.mean(held) <= 1.0  # 95 % asked for; the bootstrap of 10 seeds is known to be a little narrow
+    assert np.isnan(interval(run_seeds(1))).all()
+    with pytest.raises(InvalidParameterError, match="seeds, targets"):
+        interval(np.zeros(3))
+
+
+def test_probability_of_improvement_and_profile() -> None:
+    ours, theirs = np.array([[1.0, 5.0], [1.0, 5.0]]), np.array([[2.0, 5.0]])
+    assert probability_of_improvement(ours, theirs) == pytest.approx(0.75)  # always better on one, always equal on the other
+    assert probability_of_improvement(theirs, ours) == pytest.approx(0.25)
+    with pytest.raises(InvalidParameterError, match="same targets"):
+        probability_of_improvement(ours, theirs[:, :1])
+    np.testing.assert_allclose(performance_profile(ours, np.array([0.5, 1.0, 9.0])), [0.0, 0.5, 1.0])
+
+
+def test_registered_targets_are_what_their_seed_draws() -> None:
+    assert json.loads(registered.PATH.read_text(encoding="utf-8")) == registered.draw()
+    places = registered.read("earth", "touchdown")
+    assert {p: len(t) for p, t in places.items()} == registered.COUNTS
+    with pytest.raises(InvalidParameterError, match="registered"):
+        registered.read("mars", "rest")
+
+
+def test_moved_starts_are_moved_by_what_is_said_and_the_first_not_at_all() -> None:
+    stretches = np.array([(0.3, 0.4, 0.5, 0.6), (0.5, 0.5, 0.4, 0.3)])
+    hops = Hops(QUICK, {})
+    landings = hops.perturbed(stretches, 3)
+    assert landings.shape == (2, 4, 2)
+    assert hops.calls == 8
+    np.testing.assert_array_equal(landings[:, 0], simulate(stretches, scene=QUICK).landing)
+    moved = np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2)
+    assert (moved > 0).all()
+    assert (moved < 100 * PERTURBATION).all()
+    twice = repeated(form_find(stretches, scene=QUICK), 2)
+    np.testing.assert_array_equal(twice.stretches, stretches[[0, 0, 1, 1]])
+    np.testing.assert_array_equal(twice.energies["bars"][::2], twice.energies["bars"][1::2])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished quick comparison."""
+    folder = tmp_path_factory.mktemp("compare")
+    run.main(CompareConfig(out=folder, quick=True, progress=False))
+    return folder / "quick"
+
+
+def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Path) -> None:
+    text = (folder / "results.md").read_text(encoding="utf-8")
+    for said in ("nearest stored hop", "best of 2 simulated", "SAC", "p95", "boundary", "fidelity single", "floor"):
+        assert said in text
+    pictures = sorted(p.name for p in folder.glob("*.png"))
+    assert pictures == [f"results_earth_touchdown_{kind}.png" for kind in ("calls", "pareto", "profile")]
+    kept = json.loads((folder / "stages" / "score_ensemble_1_32.json").read_text())
+    for lost in ("score_ensemble_1_32", "plans_1_32", "net_1_32"):
+        (folder / "stages" / f"{lost}.json").unlink()
+    config = replace(CompareConfig(out=folder.parent, progress=False), quick=True).shortened()
+    again = run.Comparison(config)
+    again.run()
+    assert set(again.stages.results) - set(again.stages.skipped) == {"score_ensemble_1_32", "plans_1_32", "net_1_32"}
+    assert json.loads((folder / "stages" / "score_ensemble_1_32.json").read_text())["results"] == kept["results"]
+    outcome = Outcome(again)
+    assert outcome.methods[:4] == ["nearest", "single", "ensemble", "best2"]
+    # errors are distances of the stored landings, those from the unmoved start left out
+    landings = np.array(kept["results"]["landings"])[:2, 1:]
+    wanted = np.linalg.norm(landings - again.places["inside"][:, None], axis=2).mean(axis=1)
+    np.testing.assert_allclose(outcome.errors("ensemble", 32)[1], wanted)
+
+
+def test_more_seeds_keep_what_was_run(folder: Path) -> None:
+    config = replace(CompareConfig(out=folder.parent, quick=True, progress=False).shortened(), seeds=3, latencies=0)
+    more = run.Comparison(replace(config, algorithms=()))
+    more.run()
+    done = set(more.stages.results) - set(more.stages.skipped)
+    assert done
+    assert all("_2_" in name or name == "hops_2" for name in done)
+
+
+def test_text_is_put_between_its_markers_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- begin a -->\nold\n<!-- end a -->\nafter\n")
+    assert report.replace_between(page, "a", r"new \1")
+    assert page.read_text() == "before\n<!-- begin a -->\nnew \\1\n<!-- end a -->\nafter\n"
+    assert not report.replace_between(page, "b", "text")
+    assert report.replace_between(page, "b", "text", append=True)
+    assert page.read_text().endswith("<!-- begin b -->\ntext\n<!-- end b -->\n")
+
+
+def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path, folder: Path) -> None:
+    small = replace(CompareConfig(out=tmp_path, progress=False), data=folder / "hops_0_0_32.h5", budgets=(8,))
+    with pytest.raises(DataFileError, match="expected hops in"):
+        run.Comparison(replace(small, scene="moon")).pool(0)
+    with pytest.raises(DataFileError, match="at least 64"):
+        run.Comparison(replace(small, budgets=(64,))).pool(0)
+    for changes in ({"budgets": (2,)}, {"seeds": 0}, {"algorithms": ("dqn",)}):
+        with pytest.raises(InvalidParameterError, match=next(iter(changes))):
+            CompareConfig(**changes)  # type: ignore[arg-type]

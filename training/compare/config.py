@@ -1,0 +1,108 @@
+"""What a comparison runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from surrogate.train import TrainConfig
+from tensegrity_gym.errors import InvalidParameterError
+from training.inverse import InverseConfig
+from training.tandem import TandemConfig
+
+ALGORITHMS = ("sac", "td3", "ppo")
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """Planners and policies at equal simulator calls; a rerun goes on, also with more seeds or budgets."""
+
+    out: Path = Path("runs/compare")
+    """Folder of all results of one scene and landing."""
+    scene: str = "earth"
+    """Scene preset with registered targets: earth, moon or slope."""
+    landing: str = "touchdown"
+    """Where a landing is read: touchdown or rest."""
+    fidelity: str = "paper"
+    """Model of the hop, for learning and for scoring alike: paper, or single (precision)."""
+    duration: float | None = None
+    """Longest time that a hop is followed [s]; None: the scene's. A touchdown needs no more than the longest flight."""
+    data: Path | None = None
+    """File of hops, made by `python -m surrogate generate`, in place of hops simulated for each seed: seed k takes them from
+    its k-th tenth on. Small budgets of different seeds then share no hop, large ones share most."""
+    budgets: tuple[int, ...] = (100, 1000, 10000)
+    """Simulator calls that a method may learn from."""
+    seeds: int = 10
+    """Training seeds of the planners."""
+    algorithms: tuple[str, ...] = ALGORITHMS
+    """Policies to train."""
+    policy_budgets: tuple[int, ...] | None = None
+    """Budgets of the policies; None: the same."""
+    policy_seeds: int | None = None
+    """Training seeds of the policies; None: the same."""
+    targets: int | None = None
+    """Registered targets of each place (inside, boundary, beyond) to use; None: all."""
+    perturbations: int = 8
+    """Moved starts from which every answer is simulated again."""
+    tries: tuple[int, ...] = (8, 32)
+    """Proposals that best-of-T simulates before it answers."""
+    tries_seeds: int | None = None
+    """Seeds for which best-of-T is run, which costs most hops; None: all."""
+    search: int = 400
+    """Looks per target of CMA-ES on the surrogate."""
+    oracle: int = 160
+    """Hops per target of CMA-ES on the simulator; 0: no oracle."""
+    updates: int = 3000
+    """Gradient steps of the surrogate, at most."""
+    surrogate: TrainConfig = field(default_factory=lambda: TrainConfig(test=0.0))
+    """Training of the surrogate."""
+    inverse: InverseConfig = field(default_factory=InverseConfig)
+    """Inversion of the surrogate."""
+    tandem: TandemConfig = field(default_factory=TandemConfig)
+    """Training of the tandem net."""
+    latencies: int = 100
+    """Single questions that each method's latency is measured on; 0: none."""
+    write: bool = False
+    """Write tables and figures into docs/results.md, docs/images and README.md of the working directory."""
+    quick: bool = False
+    """A run of under a minute, with hops cut off after 0.06 s, that shows that all works, and nothing else."""
+    progress: bool = True
+    """Show progress bars."""
+
+    def __post_init__(self) -> None:
+        counts = {"seeds": self.seeds, "perturbations": self.perturbations, "updates": self.updates}
+        for name, value in counts.items():
+            if value < 1:
+                raise InvalidParameterError(f"{name}: expected an integer >= 1, got {value}")
+        if not self.budgets or min(self.budgets) < 8:
+            raise InvalidParameterError(f"budgets: expected numbers >= 8, got {self.budgets}")
+        strangers = sorted(set(self.algorithms) - set(ALGORITHMS))
+        if strangers:
+            raise InvalidParameterError(f"algorithms: expected some of {ALGORITHMS}, got {strangers}")
+
+    def shortened(self) -> CompareConfig:
+        """The settings of ``quick``, in its own folder."""
+        return replace(
+            self,
+            out=self.out / "quick",
+            fidelity="single",
+            duration=0.06,
+            data=None,
+            budgets=(16, 32),
+            seeds=2,
+            algorithms=("sac",),
+            targets=2,
+            perturbations=2,
+            tries=(2,),
+            search=16,
+            oracle=4,
+            updates=50,
+            inverse=replace(self.inverse, pool=256),
+            tandem=replace(self.tandem, steps=20),
+            latencies=2,
+        )
+
+    @property
+    def budgets_of_policies(self) -> tuple[int, ...]:
+        """Budgets of the policies."""
+        return self.budgets if self.policy_budgets is None else self.policy_budgets

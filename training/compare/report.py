@@ -1,0 +1,162 @@
+"""Tables of a comparison, and where they are written."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from surrogate.storage import atomic_path, ensure_folder, package_versions
+from tensegrity_gym import MODEL_VERSION
+from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_PLACES
+from training.compare import figures
+from training.compare.results import Outcome, Summary, label
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Markdown."""
+    lines = [head, ["---"] + ["---:"] * (len(head) - 1), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _cell(found: Summary) -> str:
+    middle = f"{1e3 * found.mean:.3g}"
+    return middle if found.seeds == 1 else f"{middle} [{1e3 * found.low:.3g}, {1e3 * found.high:.3g}]"
+
+
+def by_budget(outcome: Outcome) -> str:
+    """Interquartile mean errors on targets inside, by method and budget [mm]."""
+    budgets = sorted({b for m in outcome.methods for b in outcome.budgets(m)})
+    rows = [
+        [label(m), *(_cell(outcome.summary(m, b)) if b in outcome.budgets(m) else "" for b in budgets)] for m in outcome.methods
+    ]
+    return table(["error [mm] after so many simulator calls", *(f"{b:,}".replace(",", " ") for b in budgets)], rows)
+
+
+def by_place(outcome: Outcome) -> str:
+    """Errors inside, on the boundary and beyond it, of each method at its largest budget [mm]."""
+    rows = []
+    for m in [*outcome.methods, *(["oracle"] if outcome.oracle is not None else [])]:
+        budget = outcome.budgets(m)[-1]
+        name = "CMA-ES on the simulator" if m == "oracle" else label(m)
+        cells = [f"{1e3 * outcome.summary(m, budget, place).mean:.3g}" for place in TARGET_PLACES]
+        rows.append([name, f"{budget:,}".replace(",", " "), *cells])
+    return table(["error [mm] of targets", "calls", *TARGET_PLACES], rows)
+
+
+def in_detail(outcome: Outcome) -> str:
+    """Tails, chances, latencies and learning times at each method's largest budget."""
+    rows = []
+    for m in outcome.methods:
+        budget = outcome.budgets(m)[-1]
+        found, times = outcome.summary(m, budget), outcome.latency(m)
+        comparable = m != "ensemble" and budget in outcome.budgets("ensemble")
+        rows.append(
+            [
+                label(m),
+                f"{budget:,}".replace(",", " "),
+                str(found.seeds),
+                f"{1e3 * found.p95:.3g}",
+                f"{100 * found.missed:.1f}",
+                f"{outcome.improvement('ensemble', m, budget):.2f}" if comparable else "",
+                *(["", ""] if times is None else [f"{1e3 * t:.2g}" for t in times]),
+                f"{outcome.learning_seconds(m, budget):.3g}",
+                m.removeprefix("best") if m.startswith("best") else "0",
+            ]
+        )
+    head = [
+        "method",
+        "calls",
+        "seeds",
+        "p95 [mm]",
+        f"farther than {SUCCESS_RADIUS:g} reach [%]",
+        "P(planner better)",
+        "p50 [ms]",
+        "p99 [ms]",
+        "learning [s]",
+        "calls per answer",
+    ]
+    return table(head, rows)
+
+
+def section(outcome: Outcome, pictures: str) -> str:
+    """One scene and landing, as Markdown; ``pictures`` is where its figures lie."""
+    comparison = outcome.comparison
+    config, name = comparison.config, tag(outcome)
+    rows = {p: len(points) for p, points in comparison.places.items()}
+    oracle = ""
+    if outcome.oracle is not None:
+        calls = outcome.records["oracle"]["calls_per_answer"]
+        oracle = f" CMA-ES on the simulator, {calls:.0f} hops a target, reaches {1e3 * outcome.oracle:.3g} mm."
+    budget = max(b for m in outcome.methods for b in outcome.budgets(m))
+    return f"""## {config.scene.capitalize()}, landing read at {config.landing}
+
+Run on {datetime.now(UTC).date()}: model version {MODEL_VERSION}, fidelity {config.fidelity}, reach {1e3 * outcome.reach:.0f} mm,
+targets {", ".join(f"{n} {p}" for p, n in rows.items())}, {config.perturbations} moved starts an answer,
+{package_versions_text()}.
+
+Interquartile mean over targets inside and seeds, with its 95 % interval over seeds. The floor, how far a random hop's landing
+moves with its start, is {1e3 * outcome.floor:.2g} mm.{oracle}
+
+{by_budget(outcome)}
+
+![Error against simulator calls]({pictures}/results_{name}_calls.png)
+
+At the largest budget of each:
+
+{in_detail(outcome)}
+
+{by_place(outcome)}
+
+![Share of landings within a radius of the target, after {budget} calls]({pictures}/results_{name}_profile.png)
+
+![Learning time against error]({pictures}/results_{name}_pareto.png)
+"""
+
+
+def package_versions_text() -> str:
+    """Versions that results may depend on."""
+    kept = package_versions()
+    return ", ".join(f"{name} {kept[name]}" for name in ("torch", "stable-baselines3") if name in kept)
+
+
+def tag(outcome: Outcome) -> str:
+    """Name of a task in markers and files."""
+    return f"{outcome.comparison.config.scene}_{outcome.comparison.config.landing}"
+
+
+def write_all(outcome: Outcome, page: Path, images: Path, readme: Path | None = None) -> list[Path]:
+    """Figures into ``images``; the task's section into ``page`` and its table into ``readme``, between their markers."""
+    ensure_folder(images)
+    name = tag(outcome)
+    budget = max(b for m in outcome.methods for b in outcome.budgets(m))
+    written = [
+        figures.sample_efficiency(outcome, images / f"results_{name}_calls.png"),
+        figures.profiles(outcome, budget, images / f"results_{name}_profile.png"),
+        figures.pareto(outcome, images / f"results_{name}_pareto.png"),
+    ]
+    relative = Path(os.path.relpath(images, page.parent)).as_posix()
+    replace_between(page, name, section(outcome, relative), append=True)
+    written.append(page)
+    if readme is not None and readme.exists() and replace_between(readme, name, by_budget(outcome)):
+        written.append(readme)
+    return written
+
+
+def replace_between(path: Path, name: str, text: str, *, append: bool = False) -> bool:
+    """Put ``text`` between the markers of ``name`` in ``path``; without markers at its end if ``append``. True if written."""
+    begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    block = f"{begin}\n{text.strip()}\n{end}"
+    pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+    if pattern.search(before):
+        after = pattern.sub(lambda _: block, before)
+    elif append:
+        after = before.rstrip() + ("\n\n" if before.strip() else "") + block + "\n"
+    else:
+        return False
+    with atomic_path(path) as temporary:
+        temporary.write_text(after, encoding="utf-8")
+    return True

@@ -1,0 +1,144 @@
+"""Errors gathered from the stages of a comparison, and the numbers made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_LIMIT, TARGET_PLACES, reach
+from tensegrity_gym.types import Floats
+from training.compare.run import Comparison
+from training.compare.statistics import interquartile_mean, interval, probability_of_improvement
+
+LABELS = {
+    "nearest": "nearest stored hop",
+    "single": "planner, one net",
+    "ensemble": "planner, ensemble and its doubt",
+    "tandem": "tandem net",
+    "cma": "CMA-ES on the surrogate",
+    "sac": "SAC",
+    "td3": "TD3",
+    "ppo": "PPO",
+}
+
+
+def label(method: str) -> str:
+    """A method's name in tables and figures."""
+    return f"the same, best of {method[4:]} simulated" if method.startswith("best") else LABELS.get(method, method)
+
+
+def _place(method: str) -> tuple[int, int]:
+    """Order of methods in tables: best-of-T follows the planner that proposes."""
+    known = list(LABELS)
+    if method.startswith("best"):
+        return known.index("ensemble"), int(method[4:])
+    return (known.index(method) if method in known else len(known)), 0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Errors of one method at one budget, on the targets of one place."""
+
+    mean: float  #: interquartile mean [m]
+    low: float  #: its 95 % interval [m]
+    high: float  #: likewise [m]
+    p95: float  #: of single landings [m]
+    missed: float  #: share of single landings farther than ``SUCCESS_RADIUS`` reaches from the target [-]
+    seeds: int
+
+
+class Outcome:
+    """What a comparison found."""
+
+    def __init__(self, comparison: Comparison) -> None:
+        self.comparison = comparison
+        self.records = comparison.stages.results
+        self.seconds = comparison.stages.seconds
+        self.reach = reach(comparison.scene)
+        self.rows = {
+            place: np.repeat([p == place for p in TARGET_PLACES], [len(comparison.places[p]) for p in TARGET_PLACES])
+            for place in TARGET_PLACES
+        }
+
+    @cached_property
+    def scores(self) -> dict[tuple[str, int], list[int]]:
+        """Seeds that were run, by method and budget, methods in the order of tables."""
+        found: dict[tuple[str, int], list[int]] = {}
+        for name in self.records:
+            if name.startswith("score_"):
+                method, seed, budget = name.removeprefix("score_").rsplit("_", 2)
+                found.setdefault((method, int(budget)), []).append(int(seed))
+        return dict(sorted(found.items(), key=lambda item: (_place(item[0][0]), item[0][1])))
+
+    @property
+    def methods(self) -> list[str]:
+        """Methods that were run, without the oracle."""
+        return [m for m in dict.fromkeys(m for m, _ in self.scores) if m != "oracle"]
+
+    def budgets(self, method: str) -> list[int]:
+        """Budgets at which a method was run."""
+        return [b for m, b in self.scores if m == method]
+
+    def landing_errors(self, method: str, budget: int, place: str) -> Floats:
+        """Of every answer from every moved start [m], shape (seeds, targets, perturbations).
+
+        A failed hop counts as one that landed as far away as any target may be.
+        """
+        rows = self.rows[place]
+        targets = self.comparison.targets[rows]
+        parts = []
+        for seed in self.scores[method, budget]:
+            landings = np.array(self.records[f"score_{method}_{seed}_{budget}"]["landings"], dtype=np.float64)[rows, 1:]
+            parts.append(np.linalg.norm(landings - targets[:, None], axis=2))
+        return np.nan_to_num(np.stack(parts), nan=TARGET_LIMIT * self.reach)
+
+    def errors(self, method: str, budget: int, place: str = "inside") -> Floats:
+        """Mean over the moved starts [m], shape (seeds, targets)."""
+        return self.landing_errors(method, budget, place).mean(axis=2)
+
+    def summary(self, method: str, budget: int, place: str = "inside") -> Summary:
+        """The numbers of a table's cell."""
+        every, errors = self.landing_errors(method, budget, place), self.errors(method, budget, place)
+        return Summary(
+            float(interquartile_mean(errors)),
+            *interval(errors),
+            p95=float(np.quantile(every, 0.95)),
+            missed=float((every > SUCCESS_RADIUS * self.reach).mean()),
+            seeds=len(errors),
+        )
+
+    @property
+    def floor(self) -> float:
+        """How far moved starts land from where the unmoved one does, interquartile mean over random hops [m]."""
+        return float(interquartile_mean(np.array(self.records["floor"]["distances"]).mean(axis=1)))
+
+    @property
+    def oracle(self) -> float | None:
+        """Interquartile mean error of CMA-ES on the simulator [m], None where it was not run."""
+        found = [b for m, b in self.scores if m == "oracle"]
+        return self.summary("oracle", found[0]).mean if found else None
+
+    def improvement(self, method: str, other: str, budget: int) -> float:
+        """Chance that ``method`` errs less than ``other`` on a target inside."""
+        return probability_of_improvement(self.errors(method, budget), self.errors(other, budget))
+
+    def learning_seconds(self, method: str, budget: int) -> float:
+        """Mean wall time that a method learnt for, simulating left out [s]."""
+        times = []
+        for seed in self.scores[method, budget]:
+            tag = f"{seed}_{budget}"
+            if f"policy_{method}_{tag}" in self.records:
+                record = self.records[f"policy_{method}_{tag}"]
+                times.append(record["seconds"] - record["simulating"])
+            else:
+                plans = self.records[f"plans_{tag}"]
+                own = plans.get("ensemble" if method.startswith("best") else method, {"seconds": 0.0})["seconds"]
+                times.append(own + (0.0 if method == "nearest" else self.seconds[f"net_{tag}"]))
+        return float(np.mean(times))
+
+    def latency(self, method: str) -> tuple[float, float] | None:
+        """Median and 99th percentile of a single question's wall time [s]."""
+        times = self.records.get("latency", {}).get(method)
+        return None if times is None else (float(np.median(times)), float(np.quantile(times, 0.99)))

@@ -1,0 +1,260 @@
+"""The stages of a comparison. Each is kept when it is done, so that a killed or enlarged comparison goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surrogate import dataset, model
+from surrogate.dataset import HopData
+from surrogate.generate import sample_stretches
+from tensegrity_gym import Scene
+from tensegrity_gym.task import check_fidelity
+from training.compare import targets as registered
+from training.compare.config import CompareConfig
+from training.compare.hops import Hops
+from training.compare.learn import PLANNERS, Fitted, fit_net, fit_planners, from_file, save_net, simulated
+from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.planner import BestOfPlanner, NearestHopPlanner, Planner
+from training.policies import ActorPolicy
+from training.stages import Results, Stages
+
+#: Hops of a pool that are simulated, and kept, together.
+BLOCK = 2048
+#: Random hops that the floor is measured on.
+FLOOR_HOPS = 64
+#: Targets of questions whose latency is measured.
+LATENCY_SEED = 5
+
+
+class Comparison:
+    """One scene and landing."""
+
+    def __init__(self, config: CompareConfig) -> None:
+        self.config = config
+        changes = {} if config.duration is None else {"duration": config.duration}
+        self.scene = Scene.preset(config.scene, landing=config.landing, **changes)
+        self.hops = Hops(self.scene, check_fidelity(config.fidelity))
+        self.stages = Stages(Path(config.out), say=print if config.progress else lambda _: None)
+        self.places = registered.read(config.scene, config.landing, config.targets)
+        self.targets = np.concatenate(list(self.places.values()))
+        #: What every stage's record depends on.
+        self.base = {"scene": asdict(self.scene), "fidelity": config.fidelity}
+        self._fitted: dict[tuple[int, int], Fitted] = {}
+        self._pools: dict[int, HopData] = {}
+
+    def run(self) -> None:
+        """All stages, cheap ones first."""
+        config = self.config
+        self._floor()
+        for seed in range(config.seeds):
+            for budget in config.budgets:
+                self._planners(seed, budget)
+                if seed < (config.seeds if config.tries_seeds is None else config.tries_seeds):
+                    self._best_of(seed, budget)
+        self._oracle()
+        for seed in range(config.seeds if config.policy_seeds is None else config.policy_seeds):
+            for budget in config.budgets_of_policies:
+                for algorithm in config.algorithms:
+                    self._policy(algorithm, seed, budget)
+        if config.latencies:
+            self._latency()
+
+    def pool(self, seed: int) -> HopData:
+        """The hops of a seed: as many as the largest budget; smaller budgets are its first rows."""
+        if seed in self._pools:
+            return self._pools[seed]
+        most = max(self.config.budgets)
+        if self.config.data is not None:
+            found = from_file(self.config.data, self.scene, seed, most)
+            self.stages.run(f"hops_{seed}", self.base | {"digest": found.digest}, lambda: {"seconds": found.seconds})
+        else:
+            found = dataset.concatenate([self._block(seed, k, most) for k in range(0, most, BLOCK)])
+            content = self.base | {"hops": len(found), "digest": found.digest}
+            self.stages.run(f"hops_{seed}", content, lambda: {"seconds": found.seconds})
+        self._pools = {seed: found}  # one at a time in memory
+        return found
+
+    def _block(self, seed: int, first: int, most: int) -> HopData:
+        last = min(first + BLOCK, most)
+        path = self.stages.folder / f"hops_{seed}_{first}_{last}.h5"
+
+        def work() -> Results:
+            part = simulated(self.hops, sample_stretches(last, seed)[first:last], seed)
+            dataset.write(path, part)
+            return {"seconds": part.seconds}
+
+        self.stages.run(path.stem, self.base | {"seed": seed, "first": first, "last": last}, work, files=[path.name])
+        return dataset.read(path)
+
+    def _floor(self) -> None:
+        def work() -> Results:
+            landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations)
+            return {"distances": np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2).tolist()}
+
+        self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, work)
+
+    def fitted(self, seed: int, budget: int) -> Fitted:
+        """Planners of a seed and budget."""
+        if (seed, budget) not in self._fitted:
+            data = self.pool(seed).rows(slice(0, budget))
+            net, _ = model.load(self.stages.folder / f"net_{seed}_{budget}.safetensors")
+            self._fitted = {(seed, budget): fit_planners(net, data, self.config, seed)}
+        return self._fitted[seed, budget]
+
+    def _planners(self, seed: int, budget: int) -> None:
+        config, tag = self.config, f"{seed}_{budget}"
+        path = self.stages.folder / f"net_{tag}.safetensors"
+        data = self.pool(seed).rows(slice(0, budget))
+
+        def learn() -> Results:
+            net, seconds = fit_net(data, config, seed)
+            save_net(net, path, data, seconds)
+            return {"seconds": seconds}
+
+        settings = {"surrogate": asdict(config.surrogate), "updates": config.updates}
+        self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{seed}"], files=[path.name])
+
+        def plan() -> Results:
+            fitted = self.fitted(seed, budget)
+            return {
+                name: {"stretches": fitted.planners[name].predict(self.targets)[0].tolist(), "seconds": fitted.seconds[name]}
+                for name in self.names
+            }
+
+        settings = {"inverse": asdict(config.inverse), "tandem": asdict(config.tandem), "planners": self.names}
+        self.stages.run(f"plans_{tag}", settings | {"targets": self.targets.tolist()}, plan, needs=[f"net_{tag}"])
+        for name in self.names:
+            self._score(name, seed, budget, f"plans_{tag}", partial(self._kept, f"plans_{tag}", name))
+
+    def _kept(self, stage: str, name: str) -> Results:
+        return self.stages.results[stage][name]
+
+    @property
+    def names(self) -> list[str]:
+        """Planners that can run here."""
+        return [name for name in PLANNERS if name != "cma" or find_spec("cma")]
+
+    def _best_of(self, seed: int, budget: int) -> None:
+        tag = f"{seed}_{budget}"
+        if not self.config.tries:
+            return
+
+        def work() -> Results:
+            most = max(self.config.tries)
+            proposed = self.fitted(seed, budget).inverse.propose(self.targets, most)
+            landings = self.hops.land(proposed.reshape(-1, proposed.shape[2])).reshape(*proposed.shape[:2], 2)
+            errors = np.linalg.norm(landings - self.targets[:, None], axis=2)
+            errors = np.where(np.isfinite(errors), errors, np.inf)
+            return {
+                str(tries): {"stretches": proposed[np.arange(len(proposed)), errors[:, :tries].argmin(axis=1)].tolist()}
+                for tries in self.config.tries
+            }
+
+        self.stages.run(f"best_{tag}", {"tries": self.config.tries}, work, needs=[f"plans_{tag}"])
+        for tries in self.config.tries:
+            self._score(f"best{tries}", seed, budget, f"best_{tag}", partial(self._kept, f"best_{tag}", str(tries)))
+
+    def _oracle(self) -> None:
+        if not self.config.oracle or not find_spec("cma"):
+            return
+
+        def work() -> Results:
+            planner = self._evolution()
+            stretches, _ = planner.predict(self.targets)
+            return {"stretches": stretches.tolist(), "calls_per_answer": planner.calls / len(self.targets)}
+
+        settings = {"evaluations": self.config.oracle, "targets": self.targets.tolist(), "budget": max(self.config.budgets)}
+        self.stages.run("oracle", settings, work, needs=["hops_0"])
+        self._score("oracle", 0, max(self.config.budgets), "oracle", lambda: self.stages.results["oracle"])
+
+    def _evolution(self) -> EvolutionPlanner:
+        data = self.pool(0)
+        start = NearestHopPlanner(data["stretches"][data.usable], data["landing"][data.usable])
+        population = min(16, self.config.oracle)  # as many as the simulator's lanes
+        return EvolutionPlanner(self.hops.land, start, EvolutionConfig(self.config.oracle, population, 0.04))
+
+    def _policy(self, algorithm: str, seed: int, budget: int) -> None:
+        from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
+
+        name = f"policy_{algorithm}_{seed}_{budget}"
+        path = self.stages.folder / f"{name}.safetensors"
+        settings = PolicyConfig(algorithm, calls=budget, seed=seed, fidelity=self.config.fidelity)
+
+        def work() -> Results:
+            state = path.with_suffix(".training")
+            actors, card = train_policy(self.scene, settings, progress=self.config.progress, state=state)
+            actors[budget].save(path, card)
+            return {
+                "seconds": card["seconds"],
+                "simulating": card["simulating_seconds"],
+                "values": card["train"]["hyperparameters"],
+            }
+
+        from training.algorithms import hyperparameters
+
+        content = self.base | {"config": asdict(settings), "values": hyperparameters(algorithm)}
+        self.stages.run(name, content, work, files=[path.name, path.with_suffix(".json").name])
+        self._score(algorithm, seed, budget, name, lambda: {"stretches": ActorPolicy.load(path).predict(self.targets)[0]})
+
+    def _score(self, method: str, seed: int, budget: int, needs: str, answers: Callable[[], Any]) -> None:
+        """Simulate the answers of a method, from their start and from moved ones."""
+
+        def work() -> Results:
+            stretches = np.array(answers()["stretches"])
+            landings = self.hops.perturbed(stretches, self.config.perturbations)
+            return {"stretches": stretches.tolist(), "landings": landings.tolist()}
+
+        content = self.base | {"perturbations": self.config.perturbations, "targets": self.targets.tolist()}
+        self.stages.run(f"score_{method}_{seed}_{budget}", content, work, needs=[needs])
+
+    def _latency(self) -> None:
+        budget = max(self.config.budgets)
+        policies = {a: f"policy_{a}_0_{max(self.config.budgets_of_policies)}" for a in self.config.algorithms}
+
+        def work() -> Results:
+            fitted = self.fitted(0, budget)
+            asked: dict[str, Planner] = {name: fitted.planners[name] for name in self.names}
+            asked |= {f"best{t}": BestOfPlanner(fitted.inverse, self.hops.land, t) for t in self.config.tries}
+            asked |= {a: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for a, name in policies.items()}
+            return {name: self._questions(planner, name) for name, planner in asked.items()}
+
+        needs = [f"net_0_{budget}", *policies.values()]
+        self.stages.run("latency", {"questions": self.config.latencies, "tries": self.config.tries}, work, needs=needs)
+
+    def _questions(self, planner: Planner, name: str) -> list[float]:
+        """Wall times of single questions [s], after two to warm up."""
+        slow = name.startswith("best")
+        count = max(2, self.config.latencies // 10) if slow else self.config.latencies
+        rng = np.random.default_rng(LATENCY_SEED)
+        inside = self.places["inside"]
+        times = []
+        for target in inside[rng.integers(len(inside), size=count + 2)]:
+            started = time.perf_counter()
+            planner.predict(target)
+            times.append(time.perf_counter() - started)
+        return times[2:]
+
+
+def main(config: CompareConfig) -> None:
+    """Entry of ``python -m training compare``."""
+    from training.compare import report
+    from training.compare.results import Outcome
+
+    if config.quick:
+        config = config.shortened()
+    comparison = Comparison(config)
+    comparison.run()
+    outcome = Outcome(comparison)
+    folder = comparison.stages.folder
+    report.write_all(outcome, folder / "results.md", folder)
+    if config.write:
+        report.write_all(outcome, Path("docs/results.md"), Path("docs/images"), Path("README.md"))
+    print(f"{report.by_budget(outcome)}\n\n{folder / 'results.md'}")
