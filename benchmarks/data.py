@@ -1,9 +1,10 @@
-"""What storing hops costs: committing a chunk, scheduling it on workers, reading it back. `python benchmarks/data.py`."""
+"""What single precision changes, and what storing hops costs: commit, schedule, read back. `python -m benchmarks.data`."""
 
 from __future__ import annotations
 
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,46 @@ import numpy as np
 from surrogate import dataset, generate
 from surrogate.chunks import Task, run_chunk
 from surrogate.dataset import Configuration, HopData
-from tensegrity_gym import Scene
+from tensegrity_gym import ENERGY_NAMES, HopResult, Scene, form_find, simulate
 
 CHUNKS = 60
+#: Where single precision is compared with double: hops of a flight.
+SCENES = {
+    "Earth": Scene(duration=1.3),
+    "slope of 30 degrees": Scene(slope=np.radians(30.0), slope_direction=-2.0, friction=0.9, duration=2.0),
+    "Moon": Scene.preset("moon", duration=7.0),
+}
+
+
+def rounding(hops: int = 16) -> None:
+    """Print what single precision moves, beside what 10 um at the start move."""
+    rng = np.random.default_rng(1)
+    stretches = rng.uniform(0.2, 0.8, (hops, 4))
+    for name, scene in SCENES.items():
+        start = form_find(stretches, scene=scene)
+        shift = rng.normal(size=start.positions.shape)
+        shift *= 1e-5 / np.linalg.norm(shift, axis=2, keepdims=True)
+        shift[:, :, 2] = np.maximum(shift[:, :, 2], -start.positions[:, :, 2])  # nothing starts below the ground
+        double = simulate(stretches, scene=scene, equilibria=start)
+        single = simulate(stretches, scene=scene, equilibria=start, precision="float32")
+        moved = simulate(stretches, scene=scene, equilibria=replace(start, positions=start.positions + shift))
+        apart = [1e3 * np.median(np.linalg.norm(r.touchdown - double.touchdown, axis=1)) for r in (single, moved)]
+        drift, damped = (v.mean(axis=1) / single.stored_energy for v in _drift(single, double))
+        print(
+            f"float32, {name}: touchdown moves by {apart[0]:.2f} mm, floor {apart[1]:.2f} mm (medians of {hops}); energies drift "
+            f"by {drift.mean():.2%} of the stored energy until touchdown, {damped.mean():.2%} in what damping takes"
+        )
+
+
+def _drift(single: HopResult, double: HopResult) -> tuple[np.ndarray, np.ndarray]:
+    """Departure of the sum of energies, and of the damped energy from that in float64, at touchdown [J], shapes (n, 1)."""
+    total, damping = single.energies.sum(axis=2), ENERGY_NAMES.index("dissipated_damping")
+    return np.abs(total[:, 2:3] - total[:, :1]), (single.energies - double.energies)[:, 2:3, damping]
 
 
 def main() -> None:
     """Print the costs."""
+    rounding()
     short = Configuration(scene=Scene(duration=0.01), precision="float32")
     made = run_chunk(Task(short, 0, generate.CHUNK), threads=1)
 

@@ -78,7 +78,7 @@ class GenerateConfig:
     threads: int | None = None
     """Threads of the simulator; None: all cores that this process may use."""
     scheduler: str = "threads"
-    """threads, dask (workers of this machine) or the address of a dask scheduler, tcp://host:port."""
+    """threads, dask (workers of this machine), or a dask scheduler: its address, tcp://host:port, or its file.json."""
     workers: int | None = None
     """Workers of --scheduler dask; None: one a core."""
     retries: int = 2

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from surrogate.chunks import Progress, Task
 from surrogate.hops import HopData
@@ -14,6 +18,10 @@ from tensegrity_gym.errors import InvalidParameterError, MissingExtraError, Tens
 Outcome = tuple[Task, HopData | Exception]
 #: A worker that dies takes its chunk along; a chunk that outlived no worker this often is poison.
 DEATHS = 2
+#: How often the workers are counted [s].
+CENSUS = 1.0
+#: How long a scheduler may take to write its file [s].
+PATIENCE = 120.0
 #: Chunks in flight per worker: one at work, one waiting.
 AHEAD = 2
 
@@ -48,23 +56,25 @@ def run_here(
 def run_on_cluster(
     tasks: Iterable[Task], work: Callable[..., HopData], address: str, workers: int | None, retries: int, progress: Progress
 ) -> Iterator[Outcome]:
-    """Chunks as tasks of a dask cluster: one made here for ``address`` "dask", or the scheduler at tcp://host:port.
+    """Chunks as tasks of a dask cluster: one made here for ``address`` "dask", or the scheduler at tcp://host:port, or the
+    one whose scheduler file ``address`` names.
 
     Each worker takes one chunk at a time, on one thread of its own. A killed worker's chunk goes to another one.
     """
     distributed = _distributed()
     with _client(distributed, address, workers) as client:
         waiting = iter(tasks)
+        crew = _Crew(client)
         ready = distributed.as_completed(loop=client.loop, raise_errors=False)
         of: dict[str, Task] = {}
 
-        def send(count: int) -> None:
-            for task in islice(waiting, count):
+        def send() -> None:
+            for task in islice(waiting, max(1, AHEAD * crew.size() - len(of))):
                 future = client.submit(work, task, threads=1, retries=retries, pure=False, key=f"hops-{task.first}-{task.last}")
                 of[future.key] = task
                 ready.add(future)
 
-        send(AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])))
+        send()
         for future in ready:
             task = of.pop(future.key)
             error = future.exception()
@@ -72,9 +82,22 @@ def run_on_cluster(
                 raise error
             outcome = future.result() if error is None else error
             future.release()  # else the cluster keeps every chunk
-            send(1)
+            send()
             progress(task.last - task.first)
             yield task, outcome
+
+
+class _Crew:
+    """How many workers a cluster has: on a real one they come, and go, while chunks are worked off."""
+
+    def __init__(self, client: Any) -> None:
+        self.client = client
+        self.asked, self.count = -np.inf, 0
+
+    def size(self) -> int:
+        if time.monotonic() > self.asked + CENSUS:
+            self.count, self.asked = len(self.client.nthreads()), time.monotonic()
+        return self.count
 
 
 def _distributed() -> Any:
@@ -97,12 +120,30 @@ def _client(distributed: Any, address: str, workers: int | None) -> Any:
         )
         client = distributed.Client(cluster, set_as_default=False)
         return _Both(client, cluster)
-    if "://" not in address:
-        raise InvalidParameterError(f"scheduler: expected threads, dask or an address such as tcp://host:8786, got {address!r}")
+    if address.endswith(".json"):
+        where = {"scheduler_file": _written(Path(address))}
+    elif "://" in address:
+        where = {"address": address}
+    else:
+        raise InvalidParameterError(
+            f"scheduler: expected threads, dask, an address such as tcp://host:8786 or a scheduler's file.json, got {address!r}"
+        )
     try:
-        return distributed.Client(address, timeout="30s", set_as_default=False)
+        return distributed.Client(**where, timeout="30s", set_as_default=False)
     except OSError as error:
         raise InvalidParameterError(f"scheduler: expected a dask scheduler at {address}, found none ({error})") from error
+
+
+def _written(path: Path) -> str:
+    """A scheduler's file, once it is there."""
+    until = time.monotonic() + PATIENCE
+    while not path.exists():
+        if time.monotonic() > until:
+            raise InvalidParameterError(
+                f"scheduler: expected a file {path} from `dask scheduler --scheduler-file {path}`, found none in {PATIENCE:g} s"
+            )
+        time.sleep(0.1)
+    return str(path)
 
 
 class _Both:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogate import dataset, generate
+from surrogate import dataset, generate, schedule
 from surrogate.chunks import run_chunk
 from surrogate.dataset import Configuration
 from tensegrity_gym import Scene
@@ -96,6 +98,54 @@ def test_local_cluster_is_made_and_closed(tmp_path: Path, digest: str) -> None:
     assert dataset.read(path).digest == digest
 
 
+class Meeting:
+    """A chunk's work that waits until four are at it at once; found by name, as it is not sent but lies in this process."""
+
+    grown, complete, lock = threading.Event(), threading.Event(), threading.Lock()
+    at_work = 0
+
+    @classmethod
+    def work(cls, task, **options):
+        cls.grown.wait(60)
+        if task.first:  # the first chunk is done when there are four workers, and the run may see them
+            with cls.lock:
+                cls.at_work += 1
+                if cls.at_work == 4:
+                    cls.complete.set()
+            if not cls.complete.wait(10):
+                cls.at_work -= 1
+        with cls.lock:
+            return run_chunk(task, **options)
+
+
+def test_workers_that_come_later_get_chunks_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that starts with one worker has all four at work at once when three more have come."""
+    monkeypatch.setattr(schedule, "CENSUS", 0.0)
+    path = tmp_path / "hops.h5"
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as few:
+
+        def grow() -> None:
+            few.scale(4)
+            few.wait_for_workers(4)
+            Meeting.grown.set()
+
+        threading.Timer(0.5, grow).start()
+        address = few.scheduler_address
+        generate.fill(path, HOPS, CONFIGURATION, chunk=CHUNK, scheduler=address, progress=False, work=Meeting.work)
+    assert Meeting.complete.is_set()
+    assert len(dataset.read(path)) == HOPS
+
+
+def test_scheduler_is_found_by_its_file(tmp_path: Path, cluster: Any, digest: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "scheduler.json"
+    threading.Timer(0.3, file.write_text, [json.dumps({"address": cluster.scheduler_address})]).start()  # it starts later
+    generate.fill(tmp_path / "hops.h5", HOPS, CONFIGURATION, chunk=CHUNK, scheduler=str(file), progress=False)
+    assert dataset.read(tmp_path / "hops.h5").digest == digest
+    monkeypatch.setattr(schedule, "PATIENCE", 0.0)
+    with pytest.raises(InvalidParameterError, match=r"expected a file .*none.json from `dask scheduler"):
+        generate.fill(tmp_path / "more.h5", HOPS, CONFIGURATION, scheduler=str(tmp_path / "none.json"), progress=False)
+
+
 def test_unknown_scheduler_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InvalidParameterError, match="expected threads, dask or an address"):
+    with pytest.raises(InvalidParameterError, match="expected threads, dask, an address"):
         generate.fill(tmp_path / "hops.h5", 4, CONFIGURATION, scheduler="slurm", progress=False)
