@@ -10,10 +10,12 @@ from tensegrity_gym.errors import (
     TensegrityError,
     UnknownPresetError,
 )
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.formfinding import STRETCH_RANGE, Equilibria, form_find
+from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.simulate import HopResult, Trajectory, simulate
+from tensegrity_gym.simulate import drop, simulate
 from tensegrity_gym.types import ENERGY_NAMES, HopStatus
 from tensegrity_gym.version import MODEL_VERSION, __version__
 
@@ -26,6 +28,7 @@ __all__ = [
     "DataFileError",
     "Design",
     "Equilibria",
+    "Fidelity",
     "HopResult",
     "HopStatus",
     "InvalidParameterError",
@@ -37,6 +40,7 @@ __all__ = [
     "Trajectory",
     "UnknownPresetError",
     "__version__",
+    "drop",
     "form_find",
     "simulate",
 ]

@@ -13,9 +13,10 @@ from tqdm import tqdm
 from tensegrity_gym import reachable
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, OutputFolderError, TensegrityError
+from tensegrity_gym.hops import HopResult
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.simulate import HopResult, simulate
+from tensegrity_gym.simulate import simulate
 from tensegrity_gym.types import ENERGY_NAMES, HopStatus
 
 EVENTS = ("release", "take-off", "touchdown", "end")

@@ -106,6 +106,8 @@ class Design:
     """Density of the bar [kg/m^3]."""
     bar_segments: int = 3
     """Equal segments a bar is divided into (3 is the paper's model; 1 cannot buckle)."""
+    bar_softening: float = 1.0
+    """Axial stiffness of the bars is divided by it, their buckling load is not [-]: buys larger steps with larger strains."""
     cable_diameter: float = 1e-3
     """Diameter of the cables [m]."""
     cable_modulus: float = 80e9
@@ -126,7 +128,8 @@ class Design:
             value = getattr(self, field.name)
             may_be_zero = field.name in ("prestrain", "bar_damping", "cable_damping", "hinge_damping")
             if (
-                not isinstance(value, (int, float, np.number))
+                isinstance(value, bool)
+                or not isinstance(value, (int, float, np.number))
                 or not np.isfinite(value)
                 or not (value > 0 or (may_be_zero and value == 0))
             ):
@@ -153,8 +156,8 @@ class Design:
 
     @property
     def bar_rigidity(self) -> float:
-        """Axial rigidity EA of a bar [N]."""
-        return self.bar_modulus * np.pi / 4 * self.bar_diameter**2
+        """Axial rigidity EA of a bar, softened [N]."""
+        return self.bar_modulus * np.pi / 4 * self.bar_diameter**2 / self.bar_softening
 
     @property
     def bending_rigidity(self) -> float:

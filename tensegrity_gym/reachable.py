@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike
 from tensegrity_gym.batch import Progress
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.formfinding import STRETCH_RANGE
+from tensegrity_gym.hops import HopResult
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import LANDINGS, Scene
-from tensegrity_gym.simulate import HopResult, simulate
+from tensegrity_gym.simulate import simulate
 from tensegrity_gym.types import Floats, HopStatus
 from tensegrity_gym.version import MODEL_VERSION
 

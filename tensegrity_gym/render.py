@@ -18,9 +18,10 @@ from PIL import Image
 from tensegrity_gym.canvas import TRAIL, Camera, Canvas, colour_chart
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
+from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.simulate import HopResult, Trajectory, simulate
+from tensegrity_gym.simulate import simulate
 from tensegrity_gym.types import Floats, Structure
 
 #: Size of a frame of a film, by default [pixels].
@@ -267,7 +268,7 @@ def whole_hop(result: HopResult, hop: int = 0) -> Trajectory:
     if result.trajectory is None:
         raise InvalidParameterError("whole_hop: expected a hop with frames, got none; give simulate a trajectory_rate")
     frames = int(result.trajectory.frames[hop])
-    first = (np.zeros(1), result.equilibria.positions[hop][None], result.energies[hop, :1])
+    first = (np.zeros(1), result.start_positions[hop][None], result.energies[hop, :1])
     later = (getattr(result.trajectory, name)[hop][:frames] for name in ("times", "positions", "energies"))
     joined = [np.concatenate(pair)[None] for pair in zip(first, later, strict=True)]
     return Trajectory(joined[0], joined[1], joined[2], np.array([frames + 1]))

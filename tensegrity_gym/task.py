@@ -16,11 +16,12 @@ from numpy.typing import ArrayLike
 from tensegrity_gym.batch import thread_count
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
 from tensegrity_gym.formfinding import STRETCH_RANGE
+from tensegrity_gym.hops import HopResult
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.reachable import reach_of
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.scene_ranges import SceneRanges
-from tensegrity_gym.simulate import HopResult, simulate
+from tensegrity_gym.simulate import simulate
 from tensegrity_gym.types import Floats, HopStatus
 
 #: Reward of a hop that failed (unstable or not converged), and the least reward that any hop gets [-].

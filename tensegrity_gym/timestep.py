@@ -40,19 +40,50 @@ def spring_matrix(structure: Structure, positions: Floats, weights: tuple[Floats
     return (strain.T @ strain).tocsr()
 
 
+def hinge_matrix(structure: Structure, positions: Floats, weight: Floats) -> csr_matrix:
+    """Second derivative of the hinges' energy at zero angle, mass-normalised, shape (3 n_masses, 3 n_masses).
+
+    The angle's vector at mass j is P (u_j - u_(j-1)), P across the bar's axis there: ``weight`` [N m/rad or N m s/rad] per
+    bar on its square.
+    """
+    from scipy.sparse import csr_matrix
+
+    bars = structure.bars
+    n, hinges = len(structure.mass), bars.shape[1] - 2
+    if hinges < 1:
+        return csr_matrix((3 * n, 3 * n))
+    triples = np.stack([bars[:, :-2], bars[:, 1:-1], bars[:, 2:]], axis=-1).reshape(-1, 3)
+    near = positions[triples[:, 1]] - positions[triples[:, 0]]
+    far = positions[triples[:, 2]] - positions[triples[:, 1]]
+    lengths = np.linalg.norm(near, axis=1), np.linalg.norm(far, axis=1)
+    axis = near / lengths[0][:, None] + far / lengths[1][:, None]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    shares = np.stack([1 / lengths[0], -1 / lengths[0] - 1 / lengths[1], 1 / lengths[1]], axis=1)
+    shares /= np.sqrt(structure.mass[triples])
+    scale = np.sqrt(np.repeat(weight, hinges))
+    values = scale[:, None, None, None] * across[:, :, None, :] * shares[:, None, :, None]  # hinge, row, mass, column
+    rows = np.repeat(np.arange(3 * len(triples)), 9)
+    columns = np.broadcast_to((3 * triples[:, None, :, None] + np.arange(3)), values.shape)
+    bend = csr_matrix((values.reshape(-1), (rows, columns.reshape(-1))), shape=(3 * len(triples), 3 * n))
+    return (bend.T @ bend).tocsr()
+
+
 def critical_time_step(structure: Structure, positions: Floats) -> float:
     """Largest dt [s] at which symplectic Euler with lagged damping is stable in the given posture, every member taut.
 
     The condition is that dt^2/4 K + dt/2 C has no eigenvalue (over the masses) above one; for a single mode it reads
-    dt < 2/omega (sqrt(1 + zeta^2) - zeta). Bars' axial modes set it; bending and geometric stiffness are 1e-3 of theirs.
+    dt < 2/omega (sqrt(1 + zeta^2) - zeta). Bars' axial modes set it in the paper's model; hinges count too, as they set it in
+    softened or finely divided bars. Geometric stiffness, of the order of strains, is left out.
     """
     from scipy.optimize import brentq
     from scipy.sparse.linalg import eigsh
 
     actuator_stiffness = structure.actuator_rigidity / structure.actuator_length
     stiffness = spring_matrix(structure, positions, (structure.cable_stiffness, actuator_stiffness, structure.segment_stiffness))
+    stiffness += hinge_matrix(structure, positions, structure.hinge_stiffness)
     dampings = (structure.cable_damping, structure.actuator_damping * actuator_stiffness, structure.segment_damping)
-    damping = spring_matrix(structure, positions, dampings)
+    damping = spring_matrix(structure, positions, dampings) + hinge_matrix(structure, positions, structure.hinge_damping)
     start = np.random.default_rng(0).normal(size=stiffness.shape[0])
 
     def largest(matrix: csr_matrix) -> float:
@@ -73,10 +104,10 @@ def round_down(value: float, digits: int = 3) -> float:
 
 
 @lru_cache(maxsize=64)
-def default_time_step(design: Design, lattice: Lattice) -> float:
-    """MARGIN times the critical step of the unloaded lattice [s].
+def default_time_step(design: Design, lattice: Lattice, share: float = MARGIN) -> float:
+    """``share`` times the critical step of the unloaded lattice [s].
 
     Cut to three digits, so that the eigenvalue solver's last digits, which differ between machines, move no landing.
     """
     structure = design.structure(lattice)
-    return round_down(MARGIN * critical_time_step(structure, design.unloaded_positions(lattice)))
+    return round_down(share * critical_time_step(structure, design.unloaded_positions(lattice)))

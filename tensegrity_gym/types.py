@@ -50,6 +50,14 @@ class Structure(NamedTuple):
         """Bar segments, cables and actuated cables."""
         return self.bars.shape[0] * (self.bars.shape[1] - 1) + len(self.cables) + len(self.actuators)
 
+    def member_name(self, member: int) -> str:
+        """What the axial member of that number is, in words."""
+        segments = self.bars.shape[1] - 1
+        if member < len(self.bars) * segments:
+            return f"segment {member % segments} of bar {member // segments}"
+        cable = member - len(self.bars) * segments
+        return f"cable {cable}" if cable < len(self.cables) else f"actuated cable {cable - len(self.cables)}"
+
 
 class Ground(NamedTuple):
     """The half-space z >= 0 and the gravity over it, in the frame of the ground (a slope is tilted gravity)."""
@@ -57,6 +65,7 @@ class Ground(NamedTuple):
     gravity: Floats  #: acceleration vector [m/s^2], shape (3,)
     friction: float  #: Coulomb coefficient mu [-]
     restitution: float  #: Newton coefficient e [-]
+    masses: int = 2**31 - 1  #: only the first so many masses meet the ground
 
 
 class BlockPattern(NamedTuple):
@@ -81,13 +90,14 @@ class BlockPattern(NamedTuple):
 
 
 class HopStatus(IntEnum):
-    """How one hop ended. Only the first two are flights; the rest still have finite landings."""
+    """How one hop ended. RESTED, TIME_LIMIT and STOPPED are flights; the rest still have finite landings."""
 
     RESTED = 0  #: flew, came down and came to rest
     TIME_LIMIT = 1  #: flew, but was still moving, or flying, when ``scene.duration`` was over
     NO_FLIGHT = 2  #: never left the ground with every mass
     UNSTABLE = 3  #: the integration blew up; its landing reads zero, which is no answer
     NOT_CONVERGED = 4  #: no equilibrium was found to start from; not simulated
+    STOPPED = 5  #: flew and came down; by the fidelity's choice not followed to rest, which is not a number
 
 
 #: Elastic energy is kept apart by member class; dissipated energies are cumulative. Order of ``energies`` columns.

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
+from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.lattice import Lattice
-from tensegrity_gym.simulate import HopResult, Trajectory
 from tensegrity_gym.types import Floats
 
 #: Frames per second of films and in the window: hops are shown in real time.

@@ -46,6 +46,7 @@ def test_a_failed_hop_tells_when_where_and_why(sane):
     assert "hop 3" in line
     assert "blew up by t = " in line
     assert f"mass {hops.failed_mass[3]}" in line
+    assert hops.structure.member_name(int(hops.failed_member[3])) in line
     assert "smaller dt" in line
     assert np.isfinite(hops.landing).all()
     assert (hops.landing[3] == 0).all()
@@ -75,8 +76,8 @@ def test_a_step_above_the_critical_one_is_refused_with_the_number_that_would_do(
     [
         ({"dt": -1e-5}, "dt to be a finite number > 0, got -1e-05"),
         ({"dt": np.nan}, "dt to be a finite number > 0, got nan"),
-        ({"integrator": "euler"}, "expected integrator in"),
-        ({"precision": "float16"}, "expected precision in"),
+        ({"integrator": "euler"}, "integrator: expected one of"),
+        ({"precision": "float16"}, "precision: expected one of"),
         ({"trajectory_rate": 0}, "trajectory_rate to be a finite number > 0"),
     ],
 )

@@ -13,8 +13,8 @@ from PIL import Image
 from tensegrity_gym import Design, Lattice, Scene, form_find, simulate
 from tensegrity_gym.canvas import BAR_COLOURS, CABLE_COLOURS, LIGHT, SLACK, Camera, Canvas, bar_curves, member_loads
 from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.hops import HopResult
 from tensegrity_gym.render import choose_moments, draw_posture, filmstrip, hop_frames, record_hop, watching_camera, whole_hop
-from tensegrity_gym.simulate import HopResult
 
 LATTICE, DESIGN = Lattice(2, 2), Design()
 STRUCTURE = DESIGN.structure(LATTICE)

@@ -147,7 +147,7 @@ def test_take_off_and_touchdown_lie_on_that_parabola() -> None:
         velocity = r.takeoff_velocity[hop]
         down = centre[-1, :2] - start[:2] + velocity[:2] * (r.touchdown_time[hop] - t[-1])
         np.testing.assert_allclose(r.touchdown[hop], down, rtol=0, atol=1e-9)
-        # take-off is read at the middle of a step, so its height is the parabola's up to g dt^2/8
+        # the velocity at take-off and the height at the middle of that step meet to g dt^2/8
         since = t - r.takeoff_time[hop]
         top = (centre[:, 2] - velocity[2] * since + 0.5 * G * since**2).mean() + velocity[2] ** 2 / (2 * G) - start[2]
         assert r.apex[hop] == pytest.approx(top, abs=G * r.dt**2)
@@ -182,9 +182,10 @@ def test_take_off_and_touchdown_are_when_a_plain_loop_sees_them() -> None:
             after = x[:, 2].min()
             if (before > 0) != (after > 0):
                 seen.append((done, before, after))
-    (took_off, _, height), (landed, before, after) = seen[0], seen[-1] if len(seen) == 2 else seen[1]
+    (took_off, depth, height), (landed, before, after) = seen[0], seen[-1] if len(seen) == 2 else seen[1]
     assert height > 0 >= after
-    assert r.takeoff_time[hop] == pytest.approx((took_off - 0.5) * dt, rel=1e-12)
+    ground_share = depth / (depth - height)
+    assert r.takeoff_time[hop] == pytest.approx((took_off - 1 + ground_share) * dt, rel=1e-12)
     assert r.touchdown_time[hop] == pytest.approx((landed - 1 + before / (before - after)) * dt, rel=1e-12)
 
 

@@ -15,8 +15,9 @@ from tensegrity_gym.core.integrators import runge_kutta_step, symplectic_euler_s
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import any_lane, fma, load, load1, select, splat, store, store1
 
-RESTED, TIME_LIMIT, NO_FLIGHT, UNSTABLE = 0, 1, 2, 3  # as types.HopStatus; numba takes plain integers
+RESTED, TIME_LIMIT, NO_FLIGHT, UNSTABLE, STOPPED = 0, 1, 2, 3, 5  # as types.HopStatus; numba takes plain integers
 RELEASE, TAKEOFF, TOUCHDOWN, END = 0, 1, 2, 3  # rows of HopRecords.state
+STANDING, FLYING, LANDED = 0, 1, 2  # phases of a hop
 
 
 class HopSettings(NamedTuple):
@@ -24,26 +25,35 @@ class HopSettings(NamedTuple):
 
     dt: float  #: step [s]
     lag: float  #: by how much of a step velocities trail positions: 0.5 for leapfrog, else 0
-    max_steps: int  #: longest hop [steps], a multiple of ``stride``
     stride: int  #: steps between two looks at rest, blow-up and frames
     rest_energy: float  #: kinetic energy below which a lattice on the ground counts as quiet [J]
     rest_steps: int  #: how long it must stay quiet [steps]
     flight_speed: float  #: vertical speed of the centre of mass from which leaving the ground counts as take-off [m/s]
     frame_stride: int  #: steps between two frames, a multiple of ``stride``; 0 for no frames
+    stop: int  #: event after which a hop is followed no further: END (rest), TOUCHDOWN, or TAKEOFF
+    clearance: float  #: how high the lowest mass of a flying lattice must be for TAKEOFF to be over [m]
 
 
 class HopRecords(NamedTuple):
-    """What each hop leaves behind; events are release, take-off, touchdown and end."""
+    """What each hop starts from (state at release, phase, max_steps, runaway_energy) and what it leaves behind.
 
+    Events are release, take-off, touchdown and end.
+    """
+
+    phase: np.ndarray  #: STANDING, FLYING or LANDED, at the start and then at the end, shape (n,)
+    max_steps: np.ndarray  #: longest hop [steps], a multiple of ``stride``, shape (n,)
     state: np.ndarray  #: positions [m] and velocities [m/s] at the events, shape (n, 4, 2, n_masses, 3)
     time: np.ndarray  #: of the events [s], shape (n, 4)
     dissipated: np.ndarray  #: by contact and by damping until the events [J], shape (n, 4, 2)
-    touchdown_shift: np.ndarray  #: from the touchdown state back to the instant of contact [s], shape (n,)
+    shift: np.ndarray  #: from the take-off and touchdown states to the instants that contact ended and began [s], shape (n, 2)
+    impacts: np.ndarray  #: times of the returns to the ground after touchdown [s], shape (n, n_impacts)
+    impact_count: np.ndarray  #: of them, also those past n_impacts, shape (n,)
     height: np.ndarray  #: highest z of the centre of mass [m], shape (n,)
     steps: np.ndarray  #: steps taken, shape (n,)
     runaway_energy: np.ndarray  #: kinetic energy that no sane hop reaches [J], shape (n,)
     status: np.ndarray  #: HopStatus, shape (n,)
     failed_mass: np.ndarray  #: the mass that ran away in an unstable hop, else -1, shape (n,)
+    failed_member: np.ndarray  #: the axial member with the wildest strain in an unstable hop, else -1, shape (n,)
     frame_positions: np.ndarray  #: [m], shape (n, n_frames, n_masses, 3); n_frames is 0 without frames
     frame_times: np.ndarray  #: [s], shape (n, n_frames)
     frame_energies: np.ndarray  #: [J], columns types.ENERGY_NAMES, shape (n, n_frames, 7)
@@ -66,7 +76,7 @@ class LaneState(NamedTuple):
     hop: np.ndarray  #: which hop each lane runs, -1 for none, shape (lanes,)
     step: np.ndarray  #: steps it has taken, shape (lanes,)
     quiet: np.ndarray  #: for how many steps it has been quiet on the ground, shape (lanes,)
-    flown: np.ndarray  #: whether its flight is behind it, shape (lanes,)
+    phase: np.ndarray  #: STANDING, FLYING or LANDED, shape (lanes,)
 
 
 KICK, CONTACT_LOSS, DAMPING_LOSS, AIRBORNE, LOWEST, KINETIC, HEIGHT, WAS_AIRBORNE, WAS_LOWEST = 0, 1, 2, 3, 4, 5, 6, 7, 8
@@ -75,23 +85,23 @@ N_SCALARS = 14
 
 
 @jit
-def load_hop(forces, structure, ground, actuator_length, lanes, lane, positions, dt):
-    """Put a hop at rest in ``positions`` (n_masses, 3) into a lane, with the forces that act as its actuators unlock."""
+def load_hop(forces, structure, ground, actuator_length, lanes, lane, start, dt):
+    """Put a hop with positions and velocities ``start`` (2, n_masses, 3) into a lane, with the forces that act there."""
     x, v, f = lanes.one[0], lanes.one[1], lanes.one[2]
     lowest = 1e30
-    for i in range(positions.shape[0]):
+    for i in range(start.shape[1]):
         for c in range(3):
-            x[i, c] = positions[i, c]
-            v[i, c] = 0.0
-        lowest = min(lowest, positions[i, 2])
+            x[i, c] = start[0, i, c]
+            v[i, c] = start[1, i, c]
+        lowest = min(lowest, start[0, i, 2])
     for row in range(lanes.memory.shape[0]):
         lanes.one_memory[row] = 0.0
         lanes.memory[row, lane] = 0.0
     forces(structure, actuator_length, ground.gravity, x, v, f, lanes.one_memory)
-    for i in range(positions.shape[0]):
+    for i in range(start.shape[1]):
         for c in range(3):
             lanes.x[i, c, lane] = x[i, c]
-            lanes.v[i, c, lane] = 0.0
+            lanes.v[i, c, lane] = v[i, c]
             lanes.f[i, c, lane] = f[i, c]
     for row in range(N_SCALARS):
         lanes.scalars[row, lane] = 0.0
@@ -135,26 +145,35 @@ def vertical_velocity(structure, lanes, lane):
 
 
 @jit(forceinline=False)
-def contact_change(structure, settings, lanes, lane, records, hop, flown, time):
-    """A lane left the ground or came back to it in the last step; returns whether its flight is now behind it.
+def contact_change(structure, settings, lanes, lane, records, hop, phase, time):
+    """A lane left the ground or came back to it in the last step; returns its phase from now on.
 
     Take-off is the last departure before touchdown; touchdown the first contact while the centre of mass descends. A foot
-    that still pushes while the body rises is no landing, and a tremble of the standing lattice is no flight.
+    that still pushes while the body rises is no landing, and a tremble of the standing lattice is no flight. Instants lie
+    where the straight path of the lowest mass between two steps meets the ground.
     """
-    if flown:
-        return True
-    speed = vertical_velocity(structure, lanes, lane)
-    if lanes.scalars[AIRBORNE, lane] > 0.0:
-        if speed > settings.flight_speed:
-            save_event(settings, lanes, lane, records, hop, TAKEOFF, time)
-        return False
-    if records.time[hop, TAKEOFF] <= 0.0 or speed >= 0.0:
-        return False
-    save_event(settings, lanes, lane, records, hop, TOUCHDOWN, time)
     before, after = lanes.scalars[WAS_LOWEST, lane], lanes.scalars[LOWEST, lane]
-    # contact at time - dt (1 - share), the state is at time - lag dt
-    records.touchdown_shift[hop] = settings.dt * (before / (before - after) - 1.0 + settings.lag)
-    return True
+    # of the step that has just ended, this much lies behind the instant; the saved state is lag dt before its end
+    shift = settings.dt * (before / (before - after) - 1.0 + settings.lag)
+    airborne = lanes.scalars[AIRBORNE, lane] > 0.0
+    if phase == LANDED:
+        if not airborne:
+            if records.impact_count[hop] < records.impacts.shape[1]:
+                records.impacts[hop, records.impact_count[hop]] = time - settings.lag * settings.dt + shift
+            records.impact_count[hop] += 1
+        return LANDED
+    speed = vertical_velocity(structure, lanes, lane)
+    if airborne:
+        if speed <= settings.flight_speed:
+            return phase
+        save_event(settings, lanes, lane, records, hop, TAKEOFF, time)
+        records.shift[hop, 0] = shift
+        return FLYING
+    if phase == STANDING or speed >= 0.0:
+        return phase
+    save_event(settings, lanes, lane, records, hop, TOUCHDOWN, time)
+    records.shift[hop, 1] = shift
+    return LANDED
 
 
 @jit
@@ -215,15 +234,20 @@ def save_frame(settings, lanes, lane, records, hop, time):
 
 
 @jit(forceinline=False)
-def verdict(settings, lanes, lane, runaway_energy, step, quiet, flown, flying):
+def verdict(settings, lanes, lane, records, hop, step, quiet, phase):
     """HopStatus with which a lane's hop ends now, or -1 while it goes on."""
     kinetic = lanes.scalars[KINETIC, lane]
-    if not kinetic < runaway_energy:  # also true of NaN
+    if not kinetic < records.runaway_energy[hop]:  # also true of NaN
         return UNSTABLE
+    airborne = lanes.scalars[AIRBORNE, lane] > 0.0
+    if settings.stop != END and phase == LANDED:
+        return STOPPED
+    if settings.stop == TAKEOFF and phase == FLYING and airborne and lanes.scalars[LOWEST, lane] > settings.clearance:
+        return STOPPED
     if quiet >= settings.rest_steps:
-        return RESTED if flown else NO_FLIGHT
-    if step >= settings.max_steps:
-        return TIME_LIMIT if flown or flying else NO_FLIGHT
+        return RESTED if phase == LANDED else NO_FLIGHT
+    if step >= records.max_steps[hop]:
+        return TIME_LIMIT if phase == LANDED or (phase == FLYING and airborne) else NO_FLIGHT
     return -1
 
 
@@ -241,26 +265,58 @@ def runaway_mass(lanes, lane):
 
 
 @jit(forceinline=False)
-def end_hop(settings, lanes, lane, records, hop, status, step, flown):
+def runaway_member(structure, lanes, lane):
+    """The first axial member whose length is not finite, else the one of the largest strain; numbered as in ``memory``."""
+    largest, found = -1.0, 0
+    segments = structure.bars.shape[1] - 1
+    n_segments, n_cables = structure.bars.shape[0] * segments, structure.cables.shape[0]
+    for member in range(n_segments + n_cables + structure.actuators.shape[0]):
+        if member < n_segments:
+            bar, place = member // segments, member % segments
+            i, j, natural = structure.bars[bar, place], structure.bars[bar, place + 1], structure.segment_length[bar]
+        elif member < n_segments + n_cables:
+            k = member - n_segments
+            i, j, natural = structure.cables[k, 0], structure.cables[k, 1], structure.cable_length[k]
+        else:
+            k = member - n_segments - n_cables
+            i, j, natural = structure.actuators[k, 0], structure.actuators[k, 1], structure.actuator_length[k]
+        square = 0.0
+        for c in range(3):
+            square += (lanes.x[j, c, lane] - lanes.x[i, c, lane]) ** 2
+        strain = abs(square**0.5 / natural - 1.0)
+        if member >= n_segments and square < natural * natural:
+            strain = 0.0  # slack
+        if not strain < 1e30:
+            return member
+        if strain > largest:
+            largest, found = strain, member
+    return found
+
+
+@jit(forceinline=False)
+def end_hop(structure, settings, lanes, lane, records, hop, status, step, phase):
     """Store how a hop ended. A blown-up one ends where it started: a finite number that its status disowns."""
     records.status[hop] = status
+    records.phase[hop] = phase
     records.steps[hop] = step
     records.height[hop] = lanes.scalars[HEIGHT, lane]
     if status == UNSTABLE:
         records.failed_mass[hop] = runaway_mass(lanes, lane)
+        records.failed_member[hop] = runaway_member(structure, lanes, lane)
         copy_state(records, hop, RELEASE, END)
         records.height[hop] = 0.0
         records.time[hop, END] = step * settings.dt
     else:
         save_event(settings, lanes, lane, records, hop, END, step * settings.dt)
-    if not flown:
+    if phase != LANDED:
         # still in flight: there was a take-off, and touchdown is as far as it got; no flight: neither was
-        for event in range(TOUCHDOWN if status == TIME_LIMIT else TAKEOFF, END):
+        in_flight = phase == FLYING and (status == TIME_LIMIT or status == STOPPED)
+        for event in range(TOUCHDOWN if in_flight else TAKEOFF, END):
             copy_state(records, hop, END, event)
             records.time[hop, event] = records.time[hop, END]
             records.dissipated[hop, event, 0] = records.dissipated[hop, END, 0]
             records.dissipated[hop, event, 1] = records.dissipated[hop, END, 1]
-            records.touchdown_shift[hop] = 0.0
+            records.shift[hop, event - TAKEOFF] = 0.0
 
 
 @jit(forceinline=False)
@@ -281,22 +337,23 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
     """
     count = lanes.x.shape[2]
     dt = settings.dt
-    hop, step, quiet, flown = lanes.hop, lanes.step, lanes.quiet, lanes.flown
+    hop, step, quiet, phase = lanes.hop, lanes.step, lanes.quiet, lanes.phase
     queue = first
     running = 0
     for lane in range(count):
         hop[lane] = -1
         step[lane] = 0
         quiet[lane] = 0
-        flown[lane] = False
+        phase[lane] = STANDING
         for k in range(actuator_length.shape[0]):
             lanes.actuator_length[k, lane] = actuator_length[k]
         # idle lanes must hold a sane lattice too
-        load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[first, RELEASE, 0], dt)
+        load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[first, RELEASE], dt)
         queue = next_hop(records, queue, last)
         if queue < last:
-            load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[queue, RELEASE, 0], dt)
+            load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[queue, RELEASE], dt)
             hop[lane] = queue
+            phase[lane] = records.phase[queue]
             queue += 1
             running += 1
     while running > 0:
@@ -329,7 +386,7 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
                 for lane in range(count):
                     if hop[lane] >= 0 and lanes.scalars[WAS_AIRBORNE, lane] != lanes.scalars[AIRBORNE, lane]:
                         time = (step[lane] + k + 1) * dt
-                        flown[lane] = contact_change(structure, settings, lanes, lane, records, hop[lane], flown[lane], time)
+                        phase[lane] = contact_change(structure, settings, lanes, lane, records, hop[lane], phase[lane], time)
             store1(lanes.scalars, LOWEST, lowest)
         watch(structure, lanes)
         frames_due = False
@@ -347,12 +404,10 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
                 continue
             if frames_due and step[lane] % settings.frame_stride == 0:
                 save_frame(settings, lanes, lane, records, hop[lane], step[lane] * dt)
-            limit = records.runaway_energy[hop[lane]]
-            flying = lanes.scalars[AIRBORNE, lane] > 0.0 and records.time[hop[lane], TAKEOFF] > 0.0
-            status = verdict(settings, lanes, lane, limit, step[lane], quiet[lane], flown[lane], flying)
+            status = verdict(settings, lanes, lane, records, hop[lane], step[lane], quiet[lane], phase[lane])
             if status < 0:
                 continue
-            end_hop(settings, lanes, lane, records, hop[lane], status, step[lane], flown[lane])
+            end_hop(structure, settings, lanes, lane, records, hop[lane], status, step[lane], phase[lane])
             progress[0] += 1
             hop[lane] = -1
             running -= 1
@@ -363,8 +418,8 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
                 running += 1
                 step[lane] = 0
                 quiet[lane] = 0
-                flown[lane] = False
-                start = records.state[hop[lane], RELEASE, 0]
+                phase[lane] = records.phase[hop[lane]]
+                start = records.state[hop[lane], RELEASE]
                 load_hop(forces, structure, ground, actuator_length, lanes, lane, start, dt)
 
 

@@ -40,13 +40,19 @@ def runge_kutta_step(forces, structure, actuator_length, ground, dt, kick, x, v,
 
 
 @jit
+def _touches(ground, i, height):
+    """Where mass i is on the ground, if it is one that meets it."""
+    return height <= 0.0 if i < ground.masses else height < -1e30
+
+
+@jit
 def _collide(structure, ground, x, v, work, start_x, start_v):
     """Keep the start of the step in ``work``, v after collisions; returns the energy that these dissipate [J]."""
     zero = load(x, 0, 0) * 0.0
     dissipated = zero
     for i in range(structure.mass.shape[0]):
         vx, vy, vz = load(v, i, 0), load(v, i, 1), load(v, i, 2)
-        touching = load(x, i, 2) <= 0.0
+        touching = _touches(ground, i, load(x, i, 2))
         nx, ny, nz = contact_impulse(vx, vy, vz, touching, ground.friction, ground.restitution)
         store(work, start_v + i, 0, nx)
         store(work, start_v + i, 1, ny)
@@ -67,7 +73,7 @@ def _finish(structure, ground, dt, power, x, v, work, start_x, start_v, sum_x, s
     for i in range(structure.mass.shape[0]):
         vx, vy, vz = load(work, start_v + i, 0), load(work, start_v + i, 1), load(work, start_v + i, 2)
         ax, ay, az = dt * load(work, sum_v + i, 0), dt * load(work, sum_v + i, 1), dt * load(work, sum_v + i, 2)
-        touching = load(work, start_x + i, 2) <= 0.0
+        touching = _touches(ground, i, load(work, start_x + i, 2))
         nx, ny, nz = contact_impulse(vx + ax, vy + ay, vz + az, touching, ground.friction, 0.0)
         if any_lane(touching):
             done = impulse_work(structure.mass[i], vx, vy, vz, ax, ay, az, nx, ny, nz)
@@ -79,5 +85,6 @@ def _finish(structure, ground, dt, power, x, v, work, start_x, start_v, sum_x, s
             speed = select(touching, load(v, i, c), load(work, sum_x + i, c))
             store(x, i, c, fma(speed, dt, load(work, start_x + i, c)))
         z = load(x, i, 2)
-        lowest = select(z < lowest, z, lowest)
+        if i < ground.masses:
+            lowest = select(z < lowest, z, lowest)
     return power, dissipated, lowest

@@ -29,7 +29,7 @@ def symplectic_euler_step(forces, structure, actuator_length, ground, dt, kick, 
         px, py, pz = load(x, i, 0), load(x, i, 1), load(x, i, 2)
         ax, ay, az = load(f, i, 0) * inverse, load(f, i, 1) * inverse, load(f, i, 2) * inverse
         touching = pz <= 0.0
-        if any_lane(touching):
+        if i < ground.masses and any_lane(touching):
             cx, cy, cz = contact_impulse(vx, vy, vz, touching, ground.friction, ground.restitution)
             kx, ky, kz = cx + ax, cy + ay, cz + az
             # the second pass only takes away what this step's forces push into the ground: a resting contact, e = 0
@@ -46,5 +46,6 @@ def symplectic_euler_step(forces, structure, actuator_length, ground, dt, kick, 
         store(x, i, 0, fma(vx, dt, px))
         store(x, i, 1, fma(vy, dt, py))
         store(x, i, 2, pz)
-        lowest = select(pz < lowest, pz, lowest)
+        if i < ground.masses:
+            lowest = select(pz < lowest, pz, lowest)
     return power, dissipated, lowest

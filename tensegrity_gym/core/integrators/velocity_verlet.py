@@ -25,7 +25,8 @@ def velocity_verlet_step(forces, structure, actuator_length, ground, dt, kick, x
         for c in range(3):
             store(x, i, c, fma(load(v, i, c), dt, load(x, i, c)))
         z = load(x, i, 2)
-        lowest = select(z < lowest, z, lowest)
+        if i < ground.masses:
+            lowest = select(z < lowest, z, lowest)
     power = forces(structure, actuator_length, ground.gravity, x, v, f, memory)
     return power, first + _half_kick(structure, ground, half, False, x, v, f), lowest
 
@@ -40,7 +41,7 @@ def _half_kick(structure, ground, half, collide, x, v, f):
         ax, ay, az = load(f, i, 0) * inverse, load(f, i, 1) * inverse, load(f, i, 2) * inverse
         touching = load(x, i, 2) <= 0.0
         nx, ny, nz = vx + ax, vy + ay, vz + az
-        if any_lane(touching):
+        if i < ground.masses and any_lane(touching):
             if collide:
                 cx, cy, cz = contact_impulse(vx, vy, vz, touching, ground.friction, ground.restitution)
             else:
