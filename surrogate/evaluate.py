@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 
 from surrogate import dataset, model
-from surrogate.dataset import SPLITS, HopData
-from surrogate.model import OUTPUTS, HopNet
+from surrogate.dataset import SPLITS
+from surrogate.outputs import OUTPUTS
+from surrogate.scores import rmse, spread
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 
 
@@ -25,26 +25,6 @@ class EvaluateConfig:
     """HDF5 file of hops."""
     split: str = "test"
     """train, validation, test, or all (for a file that was not trained on)."""
-
-
-def rmse(net: HopNet, data: HopData) -> dict[str, float]:
-    """Root mean square error per output over the hops that have it [m, m/s or s, see OUTPUTS]."""
-    error = net.predict(data["stretches"])[0] - model.target_columns(data)
-    with np.errstate(invalid="ignore"):
-        known = np.isfinite(error).sum(axis=0)
-        square = np.nansum(error**2, axis=0) / np.maximum(known, 1)
-    return {o.name: float(np.sqrt(square[k])) if known[k] else float("nan") for k, o in enumerate(OUTPUTS)}
-
-
-def spread(data: HopData) -> dict[str, float]:
-    """Standard deviation of each output over the hops: the RMSE of always predicting the mean [units of OUTPUTS]."""
-    return {o.name: float(value) for o, value in zip(OUTPUTS, np.nanstd(target_columns_or_nan(data), axis=0), strict=True)}
-
-
-def target_columns_or_nan(data: HopData) -> np.ndarray:
-    """Outputs of stored hops, shape (n, 9); a row of not-a-number when there is no hop at all."""
-    columns = model.target_columns(data)
-    return columns if len(columns) else np.full((1, len(OUTPUTS)), np.nan, dtype=np.float32)
 
 
 def main(config: EvaluateConfig) -> None:

@@ -1,9 +1,9 @@
-"""Train the surrogate on a file of hops, with early stopping on held-back hops."""
+"""Train the surrogate on a file of hops: heteroscedastic likelihood, early stopping on held-back hops, resumable."""
 
 from __future__ import annotations
 
-import copy
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,15 +11,17 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import tyro
-from torch import Tensor
 from tqdm import tqdm
 
 from surrogate import dataset, model
 from surrogate.dataset import HopData
-from surrogate.evaluate import rmse
+from surrogate.descent import Descent, Rows
 from surrogate.model import HopNet, NetConfig, one_thread
+from surrogate.outputs import OUTPUTS, scene_columns, target_columns
+from surrogate.scores import calibrate, rmse
+from surrogate.storage import hash_of
 from tensegrity_gym import Lattice, Scene
-from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
 
 
 @dataclass(frozen=True)
@@ -28,22 +30,30 @@ class TrainConfig:
 
     net: NetConfig = field(default_factory=NetConfig)
     """Size of the net."""
-    epochs: int = 1500
+    epochs: int = 2000
     """Most passes over the training hops."""
+    steps: int = 12_000
+    """Most gradient steps; the learning rate falls to a hundredth over as many as there will be."""
     patience: int = 300
     """Stop after so many passes without a better validation error."""
-    batch: int = 1024
+    batch: int = 512
     """Hops per gradient step."""
     lr: float = 3e-3
     """AdamW's learning rate at the start; it falls along a cosine."""
-    weight_decay: float = 1e-3
+    weight_decay: float = 0.0
     """AdamW's weight decay."""
+    beta: float = 0.5
+    """Exponent of the beta-NLL (Seitzer 2022): 0 is the Gaussian likelihood, 1 weighs all hops alike in the means."""
+    images: bool = False
+    """Train on each hop's images under the symmetries too: for a net that is not symmetric; one that is learns nothing new."""
     validation: float = 0.1
     """Share of the hops held back to stop on."""
     test: float = 0.1
     """Share of the hops never looked at in training."""
     seed: int = 0
     """Seed of weights and batches."""
+    device: str = "auto"
+    """Where to train: cpu, cuda, or auto (cuda where there is one)."""
 
 
 @dataclass(frozen=True)
@@ -53,104 +63,153 @@ class TrainCommand(TrainConfig):
     data: Annotated[Path, tyro.conf.Positional] = tyro.MISSING
     """HDF5 file made by `python -m surrogate generate`."""
     out: Path = Path("runs/surrogate.safetensors")
-    """Checkpoint to write; its card goes beside it as .json."""
+    """Checkpoint to write; its card goes beside it as .json. Killed before, the same command goes on where it was."""
+    log: Path | None = None
+    """Folder for TensorBoard's event files."""
 
 
 @one_thread()
-def train(data: HopData, config: TrainConfig, *, progress: bool = True, desc: str = "surrogate") -> tuple[HopNet, dict[str, Any]]:
-    """Train on the usable hops of ``data``; returns the net with the least validation error and its card."""
+def train(
+    data: HopData,
+    config: TrainConfig,
+    *,
+    progress: bool = True,
+    desc: str = "surrogate",
+    state: Path | None = None,
+    log: Path | None = None,
+) -> tuple[HopNet, dict[str, Any]]:
+    """Train on the usable hops of ``data``; returns the net with the least validation error and its card.
+
+    With ``state``, a file that training saves itself in from time to time: found again with the same data and settings, it
+    is continued, and ends with the bits of a training that was never interrupted. It is removed at the end.
+    """
     started = time.perf_counter()
     split = data.split(config.validation, config.test)
-    train_rows = split["train"]
     # a handful of hops may leave nothing to stop on: then stop on the training error, and the card says so
-    validation_rows = split["validation"] if len(split["validation"]) else train_rows
-    if not len(train_rows):
+    stop_on = "validation" if len(split["validation"]) else "train"
+    if not len(split["train"]):
         raise InvalidParameterError(
             f"data: expected at least one usable training hop, got {len(data)} hops of which none is; generate more"
         )
-    if data.configuration.get("scene_ranges"):
-        raise InvalidParameterError(
-            f"data: expected hops of one scene, since the surrogate is told the stretches alone, got scenes that vary in "
-            f"{sorted(data.configuration['scene_ranges'])}; train on a file of one scene"
-        )
-    torch.manual_seed(config.seed)
-    scene, lattice = Scene(**data.configuration["scene"]), Lattice(**data.configuration["lattice"])
-    net = HopNet(config.net, *model.scene_symmetries(lattice, scene))
-    inputs, targets = torch.from_numpy(data["stretches"].astype(np.float32)), torch.from_numpy(model.target_columns(data))
-    net.fit_normalisers(targets[train_rows])
-    best, epochs = _descend(net, inputs, targets, train_rows, validation_rows, config, progress, desc)
+    net, rows = _start(data, config)
+    net.fit_normalisers(rows.targets[torch.from_numpy(split["train"]).to(rows.targets.device)])
+    if config.images:
+        rows, split = _with_images(rows, split, data, net.scene)
+    fingerprint = hash_of({"data": data.digest, "train": plain(config), "outputs": [o.name for o in OUTPUTS]})
+    descent = Descent(net, rows, split["train"], split[stop_on], config)
+    before = descent.resume(state, fingerprint)
+    _descend(descent, config, progress, desc, state, fingerprint, _logger(log))
+    held_back = data.rows(data.split(config.validation, config.test)[stop_on])
+    calibrate(net, held_back)
     card = {
         "data_digest": data.digest,
         "configuration": data.configuration,
-        "train": asdict(config),
-        "hops": {name: len(rows) for name, rows in split.items()},
-        "stopped_on": "validation" if len(split["validation"]) else "train",
-        "epochs": epochs,
-        "validation_error": best,
-        "seconds": time.perf_counter() - started,
-        "rmse": {name: rmse(net, data.rows(rows)) for name, rows in split.items() if len(rows)},
+        "train": plain(config),
+        "hops": {name: len(kept) for name, kept in split.items()},
+        "stopped_on": stop_on,
+        "epochs": descent.epoch,
+        "validation_error": descent.best,
+        "seconds": before + time.perf_counter() - started,
+        "variance_factor": net.variance_factor.tolist(),
+        "rmse": {
+            name: rmse(net, data.rows(kept)) for name, kept in data.split(config.validation, config.test).items() if len(kept)
+        },
     }
+    if state is not None:
+        state.unlink(missing_ok=True)
     return net, card
 
 
+def plain(config: TrainConfig) -> dict[str, Any]:
+    """The settings that decide what is learnt, JSON-like."""
+    names = set(TrainConfig.__dataclass_fields__) - {"device"}
+    return {k: v for k, v in asdict(config).items() if k in names}
+
+
+def device_of(name: str) -> torch.device:
+    """The device that ``name`` asks for; InvalidParameterError where there is none."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
+        raise InvalidParameterError(f"device: expected cpu, auto or a device of this machine, got {name!r} ({error})") from error
+
+
+def _start(data: HopData, config: TrainConfig) -> tuple[HopNet, Rows]:
+    """A fresh net and the tensors that it learns from, on the device asked for."""
+    device = device_of(config.device)
+    torch.manual_seed(config.seed)
+    scene, lattice = Scene(**data.configuration["scene"]), Lattice(**data.configuration["lattice"])
+    ranges = data.configuration.get("scene_ranges") or {}
+    net = HopNet(config.net, *model.scene_symmetries(lattice, scene, list(ranges)), scene, ranges).to(device)
+    columns = (data["stretches"].astype(np.float32), scene_columns(data).astype(np.float32), target_columns(data))
+    return net, Rows(*(torch.from_numpy(c).to(device) for c in columns))
+
+
+def _with_images(rows: Rows, split: dict[str, np.ndarray], data: HopData, scene: Scene) -> tuple[Rows, dict[str, np.ndarray]]:
+    """Each training hop's images under the symmetries appended to the rows, and their numbers to the training rows."""
+    if data.configuration.get("scene_ranges"):
+        raise InvalidParameterError(
+            f"images: expected hops of one scene, got scenes that vary in {sorted(data.configuration['scene_ranges'])}; "
+            "generate with --symmetry instead"
+        )
+    permutations, signs = model.scene_symmetries(Lattice(**data.configuration["lattice"]), scene)
+    parts, numbers = [rows], [split["train"]]
+    for permutation, sign in zip(permutations[1:], signs[1:], strict=True):
+        turn = rows.targets.new_tensor([1 if o.axis is None else sign[o.axis] for o in OUTPUTS])
+        kept = [values[split["train"]] for values in rows]
+        numbers.append(np.arange(len(split["train"])) + sum(len(p.targets) for p in parts))
+        parts.append(Rows(kept[0][:, permutation.tolist()], kept[1], kept[2] * turn))
+    joined = Rows(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return joined, split | {"train": np.concatenate(numbers)}
+
+
 def _descend(
-    net: HopNet,
-    inputs: Tensor,
-    targets: Tensor,
-    train_rows: np.ndarray,
-    validation_rows: np.ndarray,
+    descent: Descent,
     config: TrainConfig,
     progress: bool,
     desc: str,
-) -> tuple[float, int]:
-    """Gradient descent with early stopping; leaves the best weights in ``net``. Returns validation error and epochs."""
-    optimiser = torch.optim.AdamW(net.parameters(), lr=config.lr, weight_decay=config.weight_decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.epochs, eta_min=config.lr / 100)
-    shuffle = np.random.default_rng(config.seed)
-    best, best_epoch, best_state = float("inf"), 0, copy.deepcopy(net.state_dict())
-    epoch = 0
-    with tqdm(range(1, config.epochs + 1), desc=desc, unit="epoch", disable=not progress, mininterval=0.5) as bar:
-        for epoch in bar:
-            order = shuffle.permutation(train_rows)
-            for first in range(0, len(order), config.batch):
-                rows = order[first : first + config.batch]
-                optimiser.zero_grad()
-                member_loss(net, inputs[rows], targets[rows]).backward()
-                optimiser.step()
-            schedule.step()
-            error = ensemble_error(net, inputs[validation_rows], targets[validation_rows])
-            if error < best:
-                best, best_epoch, best_state = error, epoch, copy.deepcopy(net.state_dict())
-            if epoch - best_epoch >= config.patience:
-                break
-            if epoch % 50 == 0:
-                bar.set_postfix(validation=f"{best:.3f}", refresh=False)
-    net.load_state_dict(best_state)
-    net.eval()
-    return best, epoch
+    state: Path | None,
+    fingerprint: str,
+    log: Callable[[int, dict[str, float]], None],
+) -> None:
+    """Epochs until there are no more or none helped for long; leaves the best weights in the net."""
+    with tqdm(total=descent.epochs, initial=descent.epoch, desc=desc, unit="epoch", disable=not progress, mininterval=0.5) as bar:
+        while descent.epoch < descent.epochs and descent.epoch - descent.best_epoch < config.patience:
+            loss = descent.run_epoch()
+            log(descent.epoch, {"loss/train": loss, "error/validation": descent.error, "lr": descent.rate})
+            bar.update()
+            if state is not None:
+                descent.save_at_times(state, fingerprint)
+            if descent.epoch % 50 == 0:
+                bar.set_postfix(validation=f"{descent.best:.4f}", refresh=False)
+    descent.finish()
 
 
-def member_loss(net: HopNet, stretches: Tensor, targets: Tensor) -> Tensor:
-    """Mean squared error of the members in units of each output's spread; outputs that a hop lacks do not count."""
-    wanted = (targets - net.output_mean) / net.output_scale
-    known = torch.isfinite(wanted)
-    error = torch.where(known, net.normalised(stretches) - torch.nan_to_num(wanted), 0.0)
-    return (error**2).sum() / (known.sum() * net.config.members)
+def _logger(folder: Path | None) -> Callable[[int, dict[str, float]], None]:
+    """A function that writes numbers of an epoch for TensorBoard, or does nothing."""
+    if folder is None:
+        return lambda epoch, values: None
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as missing:
+        raise MissingExtraError(
+            "log: expected tensorboard to be installed, it is not; pip install 'tensegrity-gym[learn]'"
+        ) from missing
+    writer = SummaryWriter(str(folder))
 
+    def write(epoch: int, values: dict[str, float]) -> None:
+        for name, value in values.items():
+            writer.add_scalar(name, value, epoch)
 
-@torch.no_grad()
-def ensemble_error(net: HopNet, stretches: Tensor, targets: Tensor) -> float:
-    """Root mean square error of the ensemble's mean, in units of each output's spread."""
-    wanted = (targets - net.output_mean) / net.output_scale
-    known = torch.isfinite(wanted)
-    error = torch.where(known, net.normalised(stretches).mean(dim=0) - torch.nan_to_num(wanted), 0.0)
-    return float(torch.sqrt((error**2).sum() / known.sum()))
+    return write
 
 
 def main(config: TrainCommand) -> None:
     """Entry of ``python -m surrogate train``."""
-    net, card = train(dataset.read(config.data), config)
-    card["train"] = {k: str(v) if isinstance(v, Path) else v for k, v in card["train"].items()}
+    state = config.out.with_suffix(".state.safetensors")
+    net, card = train(dataset.read(config.data), config, state=state, log=config.log)
     model.save(net, config.out, card)
     shown = ", ".join(f"{name} {value:.3g}" for name, value in card["rmse"].get("test", card["rmse"]["train"]).items())
     print(f"{config.out}: {card['epochs']} epochs in {card['seconds']:.1f} s; RMSE {shown}")

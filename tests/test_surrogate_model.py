@@ -12,9 +12,9 @@ import torch
 from surrogate import model
 from surrogate.correction import fit_correction
 from surrogate.dataset import COLUMNS, Configuration, HopData, split_share
-from surrogate.evaluate import rmse, spread
 from surrogate.generate import sample_stretches
 from surrogate.model import OUTPUTS, HopNet, NetConfig
+from surrogate.scores import rmse, spread
 from surrogate.train import TrainConfig, train
 from tensegrity_gym import Lattice, Scene, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, InvalidStretchesError
