@@ -289,7 +289,7 @@ class HopNet(nn.Module):
         if not ((values >= low - 1e-6 * np.abs(low)) & (values <= high + 1e-6 * np.abs(high))).all():
             wanted = ", ".join(f"{k} in {list(v)} {SCENE_VALUES[k]}" for k, v in self.scene_ranges.items())
             raise InvalidParameterError(f"scene: expected {wanted}, where the surrogate was trained, got {scene!r}")
-        return torch.from_numpy(np.ascontiguousarray(values))
+        return torch.from_numpy(values.copy())
 
 
 def _products(permutations: np.ndarray, signs: np.ndarray) -> np.ndarray:

@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from surrogate import model
+from surrogate import descent, model
 from surrogate.correction import fit_correction
 from surrogate.dataset import COLUMNS, Configuration, HopData, split_share
+from surrogate.descent import Descent
 from surrogate.generate import sample_stretches
 from surrogate.model import OUTPUTS, HopNet, NetConfig
-from surrogate.scores import rmse, spread
-from surrogate.train import TrainConfig, train
+from surrogate.scores import LEVELS, calibrate, coverage, of_data, rmse, spread
+from surrogate.train import TrainConfig, _start, train
 from tensegrity_gym import Lattice, Scene, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, InvalidStretchesError
 
@@ -153,3 +155,158 @@ def test_checkpoint_round_trip_and_refusals(tmp_path: Path) -> None:
             model.load(path)
     with pytest.raises(DataFileError, match="readable JSON"):
         model.load(tmp_path / "absent.safetensors")
+
+
+@pytest.mark.parametrize("config", [NetConfig(hidden=(32, 16)), NetConfig(hidden=(16, 16, 16), ballistic=True)])
+def test_net_is_equivariant_with_scenes_as_inputs_the_slope_turning_along(config: NetConfig) -> None:
+    ranges = {"gravity": (1.6, 9.81), "friction": (0.3, 0.8), "slope": (0.0, 0.3), "slope_direction": (0.0, 6.0)}
+    permutations, signs = model.scene_symmetries(LATTICE, Scene.preset("slope"), list(ranges))
+    assert len(permutations) == 4  # a slope that is an input breaks no symmetry
+    torch.manual_seed(2)
+    net = HopNet(config, permutations, signs, Scene.preset("slope"), ranges).double()
+    net.fit_normalisers(torch.randn(40, len(OUTPUTS), dtype=torch.float64))
+    stretches = torch.rand(50, 4, dtype=torch.float64) * 0.6 + 0.2
+    low, high = torch.tensor(list(ranges.values()), dtype=torch.float64).T
+    scene = low + (high - low) * torch.rand(50, 4, dtype=torch.float64)
+    names = net.scene_names
+    scene = scene[:, [list(ranges).index(name) for name in names]]
+    with torch.no_grad():
+        mean, variance = net.moments(stretches, scene)
+        for perm, sign in zip(permutations, signs, strict=True):
+            azimuth = scene[:, names.index("slope_direction")]
+            turned = scene.clone()
+            turned[:, names.index("slope_direction")] = torch.atan2(sign[1] * torch.sin(azimuth), sign[0] * torch.cos(azimuth))
+            image_mean, image_variance = net.moments(stretches[:, perm], turned)
+            torch.testing.assert_close(image_mean * torch.as_tensor(output_signs(sign)), mean, rtol=0, atol=1e-12)
+            torch.testing.assert_close(image_variance, variance, rtol=1e-12, atol=0)
+        assert not torch.allclose(net(stretches, scene), net(stretches, scene.flip(0)))
+    for bad in (None, {"gravity": 5.0}, {"gravity": 99.0, "friction": 0.5, "slope": 0.1, "slope_direction": 0.0}, (1.0, 2.0)):
+        with pytest.raises(InvalidParameterError, match=r"gravity in \[1.6, 9.81\] m/s"):
+            net.float().predict(np.full((2, 4), 0.5), bad)
+    one = net.predict(np.full((2, 4), 0.5), Scene.preset("slope", friction=0.4)).mean
+    asked = {"gravity": 9.80665, "friction": 0.4, "slope": np.radians(10), "slope_direction": [0.0, 0.0]}
+    assert np.array_equal(net.predict(np.full((2, 4), 0.5), asked).mean, one)
+    assert one.shape == (2, 9)
+
+
+def test_learns_how_landings_depend_on_a_varied_scene() -> None:
+    """Ballistic throw: landings fall as 1/gravity; a net blind to gravity could not tell them apart."""
+    data = closed_form_data(400)
+    ranges = {"gravity": (2.0, 10.0)}
+    gravity = 2.0 + 8.0 * np.random.default_rng(0).random(len(data))
+    columns = data.columns | {"scene_gravity": gravity}
+    columns["landing"] = columns["landing"] * (2.0 / gravity)[:, None]
+    varied = HopData(columns, Configuration(scene_ranges=ranges).as_dict())
+    config = replace(QUICK, net=NetConfig(hidden=(32, 32), members=2), epochs=300, batch=64)
+    net, card = train(varied, config, progress=False)
+    assert net.scene_names == ("gravity",)
+    assert card["rmse"]["test"]["landing_x"] < 0.2 * spread(varied)["landing_x"]
+    point = np.full((1, 4), 0.5) + [[0.1, -0.1, 0.1, -0.1]]
+    apart = [net.predict(point, {"gravity": g}).mean[0, 4] for g in (2.0, 10.0)]
+    assert abs(apart[0] - apart[1]) < 0.1 * spread(varied)["apex"]  # the apex of this map knows no gravity
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.5])
+def test_predicted_scatter_is_the_scatter_of_the_hops_and_calibrated(beta: float) -> None:
+    """Noise whose deviation grows tenfold over the range of the mean stretch, by a known law."""
+    data, unseen = closed_form_data(2000), closed_form_data(1200, seed=9)
+    for part, seed in ((data, 1), (unseen, 2)):
+        noise = np.random.default_rng(seed).normal(size=(len(part), 2))
+        part.columns["landing"] = part["landing"] + noise * true_scatter(part)[:, None]
+    net, card = train(data, replace(QUICK, epochs=250, beta=beta, validation=0.3), progress=False)
+    said = of_data(net, unseen)
+    ratio = said.deviation[:, :2] / true_scatter(unseen)[:, None]
+    assert np.abs(np.log(np.median(ratio))) < 0.15
+    assert np.percentile(np.abs(np.log(ratio)), 90) < 0.4
+    blind = said.deviation[:, :2].mean() / true_scatter(unseen)
+    assert np.percentile(np.abs(np.log(blind)), 90) > 0.5  # one deviation for all hops would not pass
+    covered = coverage(said, model.target_columns(unseen))[:, :2]
+    assert np.abs(covered - LEVELS[:, None]).max() < 0.05
+    np.testing.assert_allclose(net.doubt(unseen["stretches"]), np.hypot(*said.deviation[:, :2].T), rtol=1e-6)
+    assert len(card["variance_factor"]) == len(OUTPUTS)
+
+
+def true_scatter(data: HopData) -> np.ndarray:
+    return 0.02 * np.exp(4 * data["stretches"].mean(axis=1) - 0.8)
+
+
+def test_calibration_mends_a_net_that_is_too_sure() -> None:
+    data = closed_form_data(400)
+    net, _ = train(data, QUICK, progress=False)
+    with torch.no_grad():
+        net.biases[-1][..., len(OUTPUTS) :] -= 3.0
+    net.variance_factor.fill_(1.0)
+    gaps = []
+    for mend in (False, True):
+        if mend:
+            calibrate(net, data)
+        covered = coverage(of_data(net, data), model.target_columns(data))
+        gaps.append(np.abs(covered - LEVELS[:, None]).mean(axis=0).max())
+    assert gaps[0] > 0.2
+    assert gaps[1] < 0.1
+
+
+def test_killed_training_goes_on_with_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, state = closed_form_data(120), tmp_path / "net.state.safetensors"
+    config = replace(QUICK, epochs=30, batch=32)
+    whole, whole_card = train(data, config, progress=False)
+    monkeypatch.setattr(descent, "SAVE_SECONDS", 0.0)
+    run_epoch = Descent.run_epoch
+
+    def killed(self: Descent) -> float:
+        if self.epoch == 17:
+            raise KeyboardInterrupt
+        return run_epoch(self)
+
+    monkeypatch.setattr(Descent, "run_epoch", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(data, config, progress=False, state=state)
+    assert state.exists()
+    ran = []
+    monkeypatch.setattr(Descent, "run_epoch", lambda self: ran.append(self.epoch) or run_epoch(self))
+    resumed, card = train(data, config, progress=False, state=state)
+    assert ran == list(range(17, 30))
+    assert not state.exists()
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+    assert card["validation_error"] == whole_card["validation_error"]
+
+
+def test_saved_training_of_other_settings_is_not_continued_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
+    data, state = closed_form_data(60), tmp_path / "net.state.safetensors"
+    net, rows = _start(data, QUICK)
+    train_rows = data.split()["train"]
+    first = Descent(net, rows, train_rows, train_rows, QUICK)
+    first.run_epoch()
+    first.save(state, "this one")
+    second = Descent(net, rows, train_rows, train_rows, QUICK)
+    second.resume(state, "another one")
+    assert second.epoch == 0
+    second.resume(state, "this one")
+    assert second.epoch == 1
+    state.write_bytes(state.read_bytes()[:-5])
+    with pytest.raises(DataFileError, match="start anew"):
+        second.resume(state, "this one")
+
+
+def test_tensorboard_gets_loss_and_error(tmp_path: Path) -> None:
+    train(closed_form_data(40), replace(QUICK, epochs=4), progress=False, log=tmp_path)
+    read = EventAccumulator(str(tmp_path)).Reload()
+    assert [e.step for e in read.Scalars("error/validation")] == [1, 2, 3, 4]
+    assert set(read.Tags()["scalars"]) == {"loss/train", "error/validation", "lr"}
+
+
+def test_images_give_a_free_net_what_a_symmetric_one_has() -> None:
+    data = closed_form_data(60)
+    free = replace(QUICK, net=replace(QUICK.net, symmetric=False))
+    _, blind = train(data, free, progress=False)
+    _, told = train(data, replace(free, images=True), progress=False)
+    assert told["hops"]["train"] == 4 * blind["hops"]["train"]
+    assert told["validation_error"] < blind["validation_error"]
+
+
+def test_sizes_and_devices_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InvalidParameterError, match="multiples of 4"):
+        HopNet(NetConfig(hidden=(30,)), LATTICE.symmetries, LATTICE.symmetry_signs)
+    with pytest.raises(InvalidParameterError, match="device"):
+        train(closed_form_data(20), replace(QUICK, device="abacus"), progress=False)
