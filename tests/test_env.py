@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.save_video import save_video
 from scipy.stats import qmc
 
 import tensegrity_gym  # noqa: F401 (registers the env)
@@ -317,21 +318,34 @@ def test_all_frames_of_the_hop_are_a_list() -> None:
 
 
 def test_a_video_has_the_whole_hop(tmp_path: Path) -> None:
+    """From our RecordVideo, and from gymnasium's save_video; gymnasium's RecordVideo keeps one picture a call."""
     pytest.importorskip("moviepy")
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    env = RecordVideo(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array_list"), str(tmp_path / "all"))
-    env.reset(seed=0)
-    env.step(MIDDLE)
+
+    def film(folder: str) -> tuple[int, float]:
+        (path,) = (tmp_path / folder).glob("*.mp4")
+        return imageio_ffmpeg.count_frames_and_secs(str(path))
+
+    def hop(env: gym.Env) -> None:
+        env.reset(seed=0)
+        env.step(MIDDLE)
+
+    env: gym.Env = RecordVideo(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array_list"), str(tmp_path / "all"))
+    hop(env)
     env.close()
-    (film,) = (tmp_path / "all").glob("*.mp4")
-    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
+    frames, seconds = film("all")
     assert abs(frames - (2 + SHORT.duration * 30)) <= 1
     assert seconds == pytest.approx(frames / 30, abs=0.02)
-    env = RecordVideo(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array"), str(tmp_path / "two"))
-    env.reset(seed=0)
-    env.step(MIDDLE)
-    assert len(env.recorded_frames) == 2  # a picture and a filmstrip
-    env.close()
+    env = gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array_list")
+    hop(env)
+    pictures: Any = env.render()
+    save_video(pictures, str(tmp_path / "saved"), fps=env.metadata["render_fps"])
+    assert film("saved") == (frames, seconds)
+    for mode, wrapper in (("rgb_array", RecordVideo), ("rgb_array", gym.wrappers.RecordVideo)):
+        env = wrapper(gym.make("TensegrityHop-v0", scene=SHORT, render_mode=mode), str(tmp_path / wrapper.__module__))
+        hop(env)
+        assert len(env.recorded_frames) == 2  # a picture and a filmstrip
+        env.close()
 
 
 def test_a_person_sees_all_frames_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,6 +131,29 @@ def test_an_episode_ends_on_arrival_or_after_the_last_hop() -> None:
         env.step(UNEVEN)
 
 
+def test_every_option_does_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+    real = travel.simulate
+
+    def noted(*given: Any, **named: Any) -> Any:
+        asked.append(named)
+        return real(*given, **named)
+
+    monkeypatch.setattr(travel, "simulate", noted)
+    env = TensegrityTravelEnv(scene=SHORT, distance=3.0, success_radius=2.999, success_bonus=4.0, hop_cost=0.7, fidelity="single")
+    _, first = env.reset(seed=0)
+    assert first["distance"] == pytest.approx(3.0 * first["reach"], rel=1e-12)
+    goal = 3.01 * first["reach"]  # too far to have arrived, unless the hop brings it nearer
+    env.reset(options={"goal": (-goal, 0.0)})
+    for sign in (-1, 1):  # away from the goal by chance, or towards it
+        _, info = env.reset(options={"goal": (sign * goal, 0.0)})
+        _, reward, arrived, _, after = env.step(UNEVEN)
+        nearer = (info["distance"] - after["distance"]) / info["reach"]
+        assert arrived == (after["distance"] <= 2.999 * info["reach"])
+        assert reward == pytest.approx(nearer - 0.7 + 4.0 * arrived, rel=1e-12)
+    assert {one["precision"] for one in asked} == {"float32"}
+
+
 def test_a_failed_hop_gets_the_worst_reward_and_ends_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     real = simulate(UNEVEN.astype(float), scene=SHORT, trajectory_rate=10.0)
     broken = replace(real, status=np.array([int(HopStatus.UNSTABLE)]), rest=np.full((1, 2), np.nan))
