@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from tensegrity_gym import task
 from tensegrity_gym.errors import InvalidParameterError, ResetNeededError
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.formfinding import STRETCH_RANGE
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
@@ -30,7 +31,7 @@ class HopTask:
         success_radius: float = task.SUCCESS_RADIUS,
         success_bonus: float = 0.0,
         energy_cost: float = 0.0,
-        fidelity: str | Mapping[str, Any] = "paper",
+        fidelity: str | Fidelity | Mapping[str, Any] = "paper",
     ) -> None:
         self.rule = task.RewardRule(success_radius, success_bonus, energy_cost)
         self.levers = task.check_fidelity(fidelity)
@@ -75,7 +76,7 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
         success_radius: errors up to this are a success [reaches].
         success_bonus: added to the reward of a success [-].
         energy_cost: taken off the reward per joule stored [1/J].
-        fidelity: "paper", "single" (float32), or arguments of ``simulate`` out of ``task.LEVERS``.
+        fidelity: a name out of ``task.FIDELITY_NAMES``, a Fidelity, or a mapping of what differs from the paper's model.
         render_mode: None; "rgb_array": the posture before the hop, then a filmstrip of it; "rgb_array_list": all frames
             since the last look, at ``render_fps``; "human": a window that shows them in real time.
     """
@@ -91,7 +92,7 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
         success_radius: float = task.SUCCESS_RADIUS,
         success_bonus: float = 0.0,
         energy_cost: float = 0.0,
-        fidelity: str | Mapping[str, Any] = "paper",
+        fidelity: str | Fidelity | Mapping[str, Any] = "paper",
         render_mode: str | None = None,
     ) -> None:
         self.render_mode = check_render_mode(render_mode)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike
 
 from tensegrity_gym.batch import thread_count
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
+from tensegrity_gym.fidelity import NAMES, Fidelity, changed, named_fidelity
 from tensegrity_gym.formfinding import STRETCH_RANGE
-from tensegrity_gym.hops import HopResult
+from tensegrity_gym.hops import HopResult, positive
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.reachable import reach_of
 from tensegrity_gym.scene import Scene
@@ -34,10 +35,10 @@ TARGET_LIMIT = 2.0
 TARGET_PLACES = ("inside", "boundary", "beyond")
 #: Targets from beyond lie between these multiples of the boundary's distance, but within TARGET_LIMIT.
 BEYOND = (1.1, 1.5)
-#: Named models of a hop, as arguments of ``simulate``: the paper's, or the same in single precision.
-FIDELITIES: dict[str, dict[str, Any]] = {"paper": {}, "single": {"precision": "float32"}}
-#: Arguments of ``simulate`` that a fidelity may be made of.
-LEVERS = ("dt", "integrator", "precision")
+#: What a fidelity may be made of, if it is given as a mapping.
+LEVERS = ("dt", *(f.name for f in fields(Fidelity) if f.name != "reason"))
+#: Names of fidelities: those of ``simulate``, and the paper's in single precision.
+FIDELITY_NAMES = (*NAMES, "single")
 
 _FAILED = (int(HopStatus.UNSTABLE), int(HopStatus.NOT_CONVERGED))
 
@@ -255,13 +256,23 @@ def check_action(action: Any, shape: tuple[int, ...]) -> Floats:
     return np.clip(stretches, low, high)
 
 
-def check_fidelity(fidelity: str | Mapping[str, Any] | None) -> dict[str, Any]:
-    """Arguments of ``simulate`` that a fidelity means: a name out of ``FIDELITIES``, or a mapping of ``LEVERS``."""
+def check_fidelity(fidelity: str | Fidelity | Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of ``simulate`` that a fidelity means: one of ``FIDELITY_NAMES``, a Fidelity, or a mapping of ``LEVERS``.
+
+    A mapping names what differs from the paper's model.
+    """
+    if isinstance(fidelity, Fidelity) or (isinstance(fidelity, str) and fidelity in NAMES):
+        return {"fidelity": fidelity}
+    if isinstance(fidelity, str) and fidelity == "single":
+        return {"precision": "float32"}
     if isinstance(fidelity, Mapping) and set(fidelity) <= set(LEVERS):
-        return dict(fidelity)
-    if isinstance(fidelity, str) and fidelity in FIDELITIES:
-        return dict(FIDELITIES[fidelity])
-    raise InvalidParameterError(f"fidelity: expected one of {sorted(FIDELITIES)} or a mapping of {LEVERS}, got {fidelity!r}")
+        levers = dict(fidelity)
+        step = levers.pop("dt", None)
+        made = changed(named_fidelity("paper"), levers)
+        return {"fidelity": made} | ({} if step is None else {"dt": positive("dt", step)})
+    raise InvalidParameterError(
+        f"fidelity: expected one of {FIDELITY_NAMES}, a Fidelity or a mapping of {LEVERS}, got {fidelity!r}"
+    )
 
 
 def simulate_hops(

@@ -15,6 +15,7 @@ from tensegrity_gym import task
 from tensegrity_gym.design import Design
 from tensegrity_gym.env import show
 from tensegrity_gym.errors import InvalidParameterError, ResetNeededError
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.formfinding import STRETCH_RANGE
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
@@ -104,7 +105,7 @@ class TensegrityTravelEnv(gym.Env[np.ndarray, np.ndarray]):
         success_radius: float = 0.25,
         success_bonus: float = 1.0,
         hop_cost: float = 0.1,
-        fidelity: str | Mapping[str, Any] = "paper",
+        fidelity: str | Fidelity | Mapping[str, Any] = "paper",
         render_mode: str | None = None,
     ) -> None:
         self.render_mode = check_render_mode(render_mode)

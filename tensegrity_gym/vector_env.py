@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from tensegrity_gym import task
 from tensegrity_gym.env import HopTask
 from tensegrity_gym.errors import InvalidParameterError, ResetNeededError
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.scene_ranges import SceneRanges
 
@@ -40,7 +41,7 @@ class TensegrityHopVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         success_radius: float = task.SUCCESS_RADIUS,
         success_bonus: float = 0.0,
         energy_cost: float = 0.0,
-        fidelity: str | Mapping[str, Any] = "paper",
+        fidelity: str | Fidelity | Mapping[str, Any] = "paper",
         shared_scene: bool = False,
         render_mode: str | None = None,
     ) -> None:

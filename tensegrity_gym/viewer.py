@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
 from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.lattice import Lattice
@@ -37,6 +38,7 @@ class Viewer:
         self.rate = RATES[mode]
         self.lattice = lattice
         self._last: Trajectory | None = None
+        self._design = Design()
         self._target: Floats = np.zeros(2)
         self._pending: list[np.ndarray] = []
         self._window: Window | None = None
@@ -59,9 +61,10 @@ class Viewer:
         from tensegrity_gym import render
 
         film = render.whole_hop(result, row)
+        self._design = result.fidelity.design(Design())
         self._last = Trajectory(film.times, moved(film.positions, place), film.energies, film.frames)
         if self.mode != "rgb_array":
-            self._show(render.hop_frames(self._last, lattice=self.lattice, target=self._target))
+            self._show(render.hop_frames(self._last, lattice=self.lattice, design=self._design, target=self._target))
 
     def picture(self) -> np.ndarray:
         """The posture before a hop, or the filmstrip of the last one, shape (h, w, 3) uint8."""
@@ -69,7 +72,8 @@ class Viewer:
 
         if self._last is None:
             return render.waiting_picture(self.lattice, target=self._target)
-        return render.filmstrip(self._last, lattice=self.lattice, target=self._target - self._start())
+        target = self._target - self._start()
+        return render.filmstrip(self._last, lattice=self.lattice, design=self._design, target=target)
 
     def frames(self) -> list[np.ndarray]:
         """All frames since the last look, shape (h, w, 3) uint8 each."""

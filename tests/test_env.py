@@ -28,6 +28,7 @@ from tensegrity_gym.errors import (
     ResetNeededError,
     UnknownPresetError,
 )
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.reachable import LANDINGS, measure_reach, reach_of, save_reach, stored_reach
 from tensegrity_gym.scene_ranges import SCENE_VALUES
 from tensegrity_gym.video import RecordVideo
@@ -247,12 +248,44 @@ def test_fidelity_is_what_simulate_is_asked_for(monkeypatch: pytest.MonkeyPatch)
         return real
 
     monkeypatch.setattr(task_module, "simulate", noted)
-    levers = ({}, {"precision": "float32"}, {"dt": 1e-6, "integrator": "velocity_verlet"})
-    for fidelity, expected in zip(("paper", "single", levers[2]), levers, strict=True):
+    rough = Fidelity(step=0.9, stop="landing")
+    for fidelity, expected in (
+        ("paper", {"fidelity": "paper"}),
+        ("reference", {"fidelity": "reference"}),
+        ("auto", {"fidelity": "auto"}),
+        ("single", {"precision": "float32"}),
+        (rough, {"fidelity": rough}),
+        ({"step": 0.9, "stop": "landing"}, {"fidelity": rough}),
+        ({"dt": 1e-6, "integrator": "velocity_verlet"}, {"dt": 1e-6, "fidelity": Fidelity(integrator="velocity_verlet")}),
+    ):
         env = TensegrityHopEnv(scene=SHORT, fidelity=fidelity)
         env.reset(seed=0)
         env.step(MIDDLE)
-        assert {k: v for k, v in asked[-1].items() if k in task.LEVERS} == expected
+        assert {k: v for k, v in asked[-1].items() if k in ("dt", "precision", "fidelity")} == expected
+
+
+@pytest.mark.parametrize("mode", [None, "rgb_array_list"])
+def test_a_hop_need_not_be_followed_past_its_touchdown(mode: str | None) -> None:
+    """The same landing and reward, for less work."""
+    found = []
+    for fidelity in ("paper", {"stop": "landing"}):
+        env = TensegrityHopEnv(scene=Scene(duration=1.6), landing="touchdown", fidelity=fidelity, render_mode=mode)
+        env.reset(seed=0)
+        _, reward, terminated, _, info = env.step(MIDDLE)
+        found.append((reward, terminated, info["landing"].tolist(), info["apex"], len(env.render() or []) if mode else 0))
+        assert all(np.isfinite(value).all() for value in info.values())
+    assert found[0][:4] == found[1][:4]
+    assert info["status"] is HopStatus.STOPPED
+    assert mode is None or 20 < found[1][4] < found[0][4]
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "rgb_array_list"])
+def test_fewer_segments_are_drawn_too(mode: str) -> None:
+    env = TensegrityHopEnv(scene=SHORT, fidelity={"bar_segments": 1}, render_mode=mode)
+    env.reset(seed=0)
+    before = env.render()
+    env.step(MIDDLE)
+    assert not np.array_equal(np.asarray(env.render())[-1], np.asarray(before)[-1])
 
 
 @pytest.mark.parametrize("preset", Scene.PRESETS)
@@ -465,6 +498,9 @@ def test_options_that_mean_nothing_are_refused(options: dict[str, Any], said: st
         ({"target": (9.0, 9.0)}, InvalidParameterError, r"target: expected within .* reaches"),
         ({"fidelity": "perfect"}, InvalidParameterError, "fidelity: expected one of"),
         ({"fidelity": {"gravity": 1}}, InvalidParameterError, "fidelity: expected one of"),
+        ({"fidelity": {"step": -1.0}}, InvalidParameterError, r"Fidelity\.step: expected a finite number > 0"),
+        ({"fidelity": {"dt": 0.0}}, InvalidParameterError, "expected dt to be a finite number > 0"),
+        ({"fidelity": None}, InvalidParameterError, "fidelity: expected one of"),
         ({"render_mode": "hologram"}, InvalidParameterError, "render_mode: expected"),
     ],
 )
