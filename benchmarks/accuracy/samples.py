@@ -1,0 +1,94 @@
+"""Stretches to look at, and starts and designs perturbed by what no one can know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import qmc
+
+from tensegrity_gym import Design, Equilibria, HopResult, Lattice, Scene, form_find, simulate
+from tensegrity_gym.types import Floats, Structure
+
+#: Nobody knows a position better [m].
+POSITION = 1e-5
+#: Nor a stiffness, from member to member [-].
+MATERIAL = 1e-3
+
+
+def stretches(n: int, actuators: int = 4, seed: int = 0) -> Floats:
+    """``n`` scrambled Sobol points over the paper's range, shape (n, actuators)."""
+    points = qmc.Sobol(actuators, seed=seed).random_base2(int(np.ceil(np.log2(n))))[:n]
+    return 0.2 + 0.6 * points
+
+
+@dataclass(frozen=True)
+class ScatteredDesign(Design):
+    """A design whose members differ: every stiffness is its own, with a normal scatter.
+
+    Dampings scatter with the stiffnesses they belong to, so that loss factors stay.
+    """
+
+    scatter: float = MATERIAL
+    """Standard deviation of a member's stiffness over its mean [-]."""
+    seed: int = 1
+    """Which specimen, from 1 on."""
+
+    def structure(self, lattice: Lattice) -> Structure:
+        """One specimen of ``lattice``."""
+        rng, nominal, changed = np.random.default_rng(self.seed), super().structure(lattice), {}
+        for name, damping in (("cable_stiffness", True), ("segment_stiffness", True), ("hinge_stiffness", True)):
+            factor = 1.0 + self.scatter * rng.standard_normal(len(getattr(nominal, name)))
+            changed[name] = getattr(nominal, name) * factor
+            if damping:
+                other = name.replace("stiffness", "damping")
+                changed[other] = getattr(nominal, other) * factor
+        factor = 1.0 + self.scatter * rng.standard_normal(len(nominal.actuator_rigidity))
+        return nominal._replace(**changed, actuator_rigidity=nominal.actuator_rigidity * factor)
+
+
+def hop_perturbed(
+    kind: str,
+    seed: int,
+    found: Equilibria,
+    *,
+    design: Design,
+    scene: Scene,
+    precision: str = "float32",
+    rate: float | None = None,
+    size: float | None = None,
+) -> HopResult:
+    """The hops of ``found`` with one unknown added: "none", "positions", "actuators" or "material" (seeds from 1).
+
+    * "positions": each coordinate of each mass by a normal of 10 micrometres.
+    * "actuators": each actuated cable's length by a normal of 10 micrometres; the lattice settles again.
+    * "material": each member's stiffness by a normal of 0.1 %; the lattice settles again.
+
+    ``size`` replaces these numbers.
+    """
+    options = {"scene": scene, "precision": precision, "trajectory_rate": rate, "threads": 1}
+    rng = np.random.default_rng([seed, 99])
+    if kind == "none":
+        return simulate(found.stretches, design=design, equilibria=found, **options)  # type: ignore[arg-type]
+    if kind == "positions":
+        noise = rng.normal(0.0, POSITION if size is None else size, found.positions.shape)
+        moved = replace(found, positions=found.positions + noise)
+        return simulate(found.stretches, design=design, equilibria=moved, **options)  # type: ignore[arg-type]
+    if kind == "actuators":
+        noise = rng.normal(0.0, (POSITION if size is None else size) / design.cell_height, found.stretches.shape)
+        again = form_find(found.stretches + noise, design=design, scene=scene, threads=1, outside=True)
+        return simulate(again.stretches, design=design, equilibria=again, **options)  # type: ignore[arg-type]
+    if kind == "material":
+        values = {k: v for k, v in vars(design).items() if k in Design.__dataclass_fields__}
+        specimen = ScatteredDesign(**values, scatter=MATERIAL if size is None else size, seed=seed)
+        again = form_find(found.stretches, design=specimen, scene=scene, threads=1)
+        step = simulate_step(design)  # one step for all: a specimen's own critical step differs in the last digit
+        return simulate(found.stretches, design=specimen, equilibria=again, dt=step, **options)  # type: ignore[arg-type]
+    raise ValueError(f"hop_perturbed: expected none, positions, actuators or material, got {kind!r}")
+
+
+def simulate_step(design: Design) -> float:
+    """The default step of the nominal design [s]."""
+    from tensegrity_gym.timestep import default_time_step
+
+    return default_time_step(design, Lattice())

@@ -1,0 +1,79 @@
+"""The floor against damping, friction and restitution: what decides how far a hop can be predicted."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.accuracy.floor import hops, spread
+from benchmarks.accuracy.part import Data, Options, Part, table
+from tensegrity_gym import Design, HopStatus, Scene
+
+#: Each lever alone; everything else at its default.
+LEVERS = {
+    "hinge_damping": (0.0, 4e-5, 1.2e-4, 4e-4, 1.2e-3),
+    "cable_damping": (0.0, 1e-5, 1e-4, 3e-4),
+    "friction": (0.0, 0.3, 0.5, 1.0, 5.0),
+    "restitution": (0.0, 0.3, 0.6, 0.9),
+}
+
+
+def default(lever: str) -> float:
+    """The value that this project uses."""
+    return float(getattr(Design() if lever in Design.__dataclass_fields__ else Scene(), lever))
+
+
+def measure(options: Options) -> Data:
+    """Floors (positions, 10 micrometres) of a sample of hops for every value of every lever."""
+    n, seeds, data = options.size(48, 16), options.size(2, 1), {}
+    for lever, values in LEVERS.items():
+        for value in values:
+            changes = {} if value == default(lever) else {lever: value}
+            base = hops(options, n, "none", 0, **changes)
+            moved = [hops(options, n, "positions", seed, **changes) for seed in range(1, seeds + 1)]
+            for name in ("touchdown", "rest"):
+                data[f"{lever}/{value:g}/{name}"] = spread(base[name], [m[name] for m in moved])
+            data[f"{lever}/{value:g}/status"] = base["status"]
+            data[f"{lever}/{value:g}/travel"] = np.linalg.norm(base["rest"], axis=1)
+            data[f"{lever}/{value:g}/apex"] = base["apex"]
+    return data
+
+
+def report(d: Data) -> list[str]:
+    """Floors and what else the lever changes."""
+    rows = []
+    for lever, values in LEVERS.items():
+        for value in values:
+            at = f"{lever}/{value:g}"
+            flew = d[f"{at}/status"] <= HopStatus.TIME_LIMIT
+            cells = [lever, f"{value:g}" + (" *" if value == default(lever) else "  ")]
+            for name in ("touchdown", "rest"):
+                cells += [f"{1e3 * v:.3g}" for v in np.percentile(d[f"{at}/{name}"][flew], (50, 95))]
+            cells.append(f"{np.median(d[f'{at}/apex'][flew]):.2f}")
+            cells.append(f"{np.median(d[f'{at}/travel'][flew]):.2f}")
+            cells.append(f"{(d[f'{at}/status'] == HopStatus.RESTED).mean():.0%}")
+            rows.append(cells)
+    head = "lever  value  touchdown 50 % [mm]  95 %  rest 50 % [mm]  95 %  apex [m]  travel at rest [m]  rested in 3 s"
+    return ["* default; medians over the hops that flew", *table(head, rows)]
+
+
+def plot(d: Data) -> Figure:
+    """Medians and 95 % of the floors, one panel for each lever."""
+    figure, axes = plt.subplots(1, 4, figsize=(12, 3.3), layout="constrained", sharey=True)
+    for axis, (lever, values) in zip(axes, LEVERS.items(), strict=True):
+        place = np.arange(len(values))
+        for name, colour in (("touchdown", "C0"), ("rest", "C3")):
+            flew = [d[f"{lever}/{v:g}/status"] <= HopStatus.TIME_LIMIT for v in values]
+            marks = np.array([np.percentile(d[f"{lever}/{v:g}/{name}"][f], (50, 95)) for v, f in zip(values, flew, strict=True)])
+            axis.semilogy(place, marks[:, 0], "o-", color=colour, label=f"{name}, median")
+            axis.semilogy(place, marks[:, 1], "^:", color=colour, lw=0.8, label=f"{name}, 95 %")
+        axis.axvline(values.index(default(lever)), color="0.8", lw=6, zorder=0)
+        axis.set(xlabel=lever.replace("_", " "), xticks=place, xticklabels=[f"{v:g}" for v in values])
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("floor [m]; the bar marks the default")
+    axes[0].legend(fontsize=7)
+    return figure
+
+
+PART = Part("sensitivity", measure, report, plot)
