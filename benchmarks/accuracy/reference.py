@@ -118,7 +118,7 @@ def report(d: Data) -> list[str]:
 
 
 def _rest_lines(d: Data) -> list[str]:
-    levels = [k for k in range(5) if f"symplectic_euler/{k}/rest" in d]
+    levels = [k for k in range(4) if f"symplectic_euler/{k}/rest" in d]
     scenes = [d[f"symplectic_euler/{k}/rest"] for k in levels]
     moved = [error(a, b) for a, b in pairwise(scenes)]
     text = ", ".join(f"dt/{2**k} to dt/{2 ** (k + 1)} {1e3 * np.median(m):.1f}" for k, m in zip(levels, moved, strict=False))
