@@ -118,7 +118,7 @@ def plot(d: Data) -> Figure:
     flew = d["base/status"] <= HopStatus.TIME_LIMIT
     lam = d["stretches"][flew]
     figure, axes = plt.subplots(1, 3, figsize=(11.5, 3.6), layout="constrained")
-    for axis, name, limits in zip(axes, ("touchdown", "rest"), ((1e-5, 1e-3), (1e-4, 0.3)), strict=False):
+    for axis, name, limits in zip(axes, ("touchdown", "rest"), ((3e-5, 2e-3), (3e-3, 0.3)), strict=False):
         points = axis.scatter(
             lam @ [1.0, -1.0, 1.0, -1.0],
             lam.mean(axis=1),
@@ -134,7 +134,7 @@ def plot(d: Data) -> Figure:
             values = np.sort(d[f"{kind}/{name}"][flew])
             axes[2].semilogx(values, np.linspace(0, 1, len(values)), style, color=colour, label=f"{name}, {kind}")
     axes[2].set(xlabel="floor [m]", ylabel="share of hops below")
-    axes[2].legend(fontsize=7)
+    axes[2].legend(fontsize=7, loc="lower right")
     axes[2].grid(alpha=0.3)
     return figure
 

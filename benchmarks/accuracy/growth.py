@@ -87,6 +87,16 @@ def rates(d: Data) -> dict[str, Floats]:
     return {name: np.array(values) for name, values in found.items()}
 
 
+def flight_power(d: Data) -> Floats:
+    """p of distance ~ (time since take-off)^p over the flight from 0.1 s on: 1 for mere drift and turning, shape (n,)."""
+    t, found = d["long/times"], []
+    for hop in range(len(d["long/nodes"])):
+        off, down = d["long/takeoff_time"][hop], d["long/touchdown_time"][hop]
+        inside = (t > off + 0.1) & (t < down) & np.isfinite(d["long/nodes"][hop])
+        found.append(np.polyfit(np.log(t[inside] - off), np.log(d["long/nodes"][hop, inside]), 1)[0])
+    return np.array(found)
+
+
 def t_end(d: Data, hop: int) -> float:
     """Last time at which both hops of a pair have a frame [s]."""
     return float(d["long/times"][np.flatnonzero(np.isfinite(d["long/nodes"][hop]))[-1]])
@@ -104,6 +114,8 @@ def report(d: Data) -> list[str]:
     return [
         f"{flew.sum()} hops, starts {APART:g} m apart, nodes' distance; the tumble's first second",
         *table(head, rows),
+        f"in flight distance ~ time^p since take-off, p = {np.median(flight_power(d)[flew]):.2f} (10 to 90 %: "
+        f"{np.percentile(flight_power(d)[flew], 10):.2f} to {np.percentile(flight_power(d)[flew], 90):.2f})",
         f"turned in flight: median {np.median(degrees):.0f} degrees, 10 to 90 %: {np.percentile(degrees, 10):.0f} to "
         f"{np.percentile(degrees, 90):.0f}",
     ]

@@ -23,7 +23,7 @@ EVENTS = ("takeoff_time", "takeoff_velocity", "apex", "touchdown_time", "touchdo
 RUNS = [("symplectic_euler", k, k <= 3) for k in range(5)] + [("runge_kutta", k, False) for k in range(3)]
 SEGMENTS = (3, 5, 9, 17)
 #: Hops that DOP853 follows; each takes minutes.
-WITNESSED = 4
+WITNESSED = 3
 
 
 def run(options: Options, integrator: str, halvings: int, to_rest: bool, segments: int = 3, n: int | None = None) -> Data:

@@ -59,7 +59,7 @@ def plot(d: Data) -> Figure:
     figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained", sharex=True, sharey=True)
     for axis, name in zip(axes, SCENES, strict=True):
         axis.loglog(apart(d, name, "float64/positions", "touchdown"), apart(d, name, "float32/none", "touchdown"), "o", ms=4)
-        axis.axline((1e-4, 1e-4), slope=1, color="k", lw=0.6)
+        axis.plot([1e-6, 1e-2], [1e-6, 1e-2], color="k", lw=0.6)
         axis.set(title=name, xlabel="moved by 10 µm at the start [m]")
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("touchdown: float32 from float64 [m]")

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from tensegrity_gym import Design, Equilibria, HopResult, Lattice, Scene, form_find, simulate
+from tensegrity_gym.timestep import default_time_step
 from tensegrity_gym.types import Floats, Structure
 
 #: Nobody knows a position better [m].
@@ -57,6 +58,7 @@ def hop_perturbed(
     precision: str = "float32",
     rate: float | None = None,
     size: float | None = None,
+    lattice: Lattice | None = None,
 ) -> HopResult:
     """The hops of ``found`` with one unknown added: "none", "positions", "actuators" or "material" (seeds from 1).
 
@@ -66,7 +68,8 @@ def hop_perturbed(
 
     ``size`` replaces these numbers.
     """
-    options = {"scene": scene, "precision": precision, "trajectory_rate": rate, "threads": 1}
+    lattice = lattice or Lattice()
+    options = {"lattice": lattice, "scene": scene, "precision": precision, "trajectory_rate": rate, "threads": 1}
     rng = np.random.default_rng([seed, 99])
     if kind == "none":
         return simulate(found.stretches, design=design, equilibria=found, **options)  # type: ignore[arg-type]
@@ -76,19 +79,12 @@ def hop_perturbed(
         return simulate(found.stretches, design=design, equilibria=moved, **options)  # type: ignore[arg-type]
     if kind == "actuators":
         noise = rng.normal(0.0, (POSITION if size is None else size) / design.cell_height, found.stretches.shape)
-        again = form_find(found.stretches + noise, design=design, scene=scene, threads=1, outside=True)
+        again = form_find(found.stretches + noise, design=design, scene=scene, lattice=lattice, threads=1, outside=True)
         return simulate(again.stretches, design=design, equilibria=again, **options)  # type: ignore[arg-type]
     if kind == "material":
         values = {k: v for k, v in vars(design).items() if k in Design.__dataclass_fields__}
         specimen = ScatteredDesign(**values, scatter=MATERIAL if size is None else size, seed=seed)
-        again = form_find(found.stretches, design=specimen, scene=scene, threads=1)
-        step = simulate_step(design)  # one step for all: a specimen's own critical step differs in the last digit
+        again = form_find(found.stretches, design=specimen, scene=scene, lattice=lattice, threads=1)
+        step = default_time_step(design, lattice)  # one step for all: a specimen's own critical step differs in the last digit
         return simulate(found.stretches, design=specimen, equilibria=again, dt=step, **options)  # type: ignore[arg-type]
     raise ValueError(f"hop_perturbed: expected none, positions, actuators or material, got {kind!r}")
-
-
-def simulate_step(design: Design) -> float:
-    """The default step of the nominal design [s]."""
-    from tensegrity_gym.timestep import default_time_step
-
-    return default_time_step(design, Lattice())
