@@ -58,7 +58,7 @@ class Part:
             figure = self.plot(data)
             folder = _folder(options) if options.quick else options.images
             folder.mkdir(parents=True, exist_ok=True)
-            figure.savefig(folder / f"accuracy_{self.name}.png", dpi=90)
+            figure.savefig(folder / f"accuracy_{self.name}.png", dpi=72)
             plt.close(figure)
 
 
