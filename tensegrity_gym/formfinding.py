@@ -53,7 +53,7 @@ class Equilibria:
     stretches: Floats  #: lambda [-], shape (n, n_actuators)
     positions: Floats  #: of all masses, centre of mass above the origin [m], shape (n, n_masses, 3)
     converged: np.ndarray  #: whether the residual is below the tolerance, shape (n,)
-    iterations: np.ndarray  #: of the method, shape (n,)
+    iterations: np.ndarray  #: of the method, of Newton on the last load path tried, shape (n,)
     residual: Floats  #: largest unbalanced force on a mass [N], shape (n,)
     energy: Floats  #: elastic plus gravitational energy [J], shape (n,)
     energies: dict[str, Floats]  #: its parts: "bars", "cables", "actuators", "gravitational" [J], shape (n,) each
@@ -62,7 +62,7 @@ class Equilibria:
     bar_load: Floats  #: compression, mean over the bar's segments [N], shape (n, n_bars)
     contact_force: Floats  #: normal force of the ground on each mass [N], shape (n, n_masses)
     method: str  #: how they were found
-    evaluations: np.ndarray  #: of the energy or of the forces, shape (n,)
+    evaluations: np.ndarray  #: of the energy or of the forces, on all load paths tried, shape (n,)
     tolerance: float  #: residual asked for [N]
     max_iterations: int  #: cap of the method
 

@@ -27,6 +27,8 @@ IMPERFECTION = 1e-5
 TOLERANCE = 1e-8
 #: Up to so many equilibria Newton solves one after another, without lanes: eight at once cost as much as some alone.
 ALONE = 2
+#: Load paths, each with half the step of the one before, that Newton tries.
+TRIES = 3
 #: Fictitious masses of relaxation over the sum of the stiffnesses at them; 1/2 is the limit of linear stability.
 MASS_MARGIN = 0.55
 
@@ -39,9 +41,9 @@ class SearchOptions:
     """Residual force per mass at which an equilibrium counts as found, over a bar's Euler load [-]: 1e-8 for Newton, whose
     last step is quadratic; 2e-6 for relaxation; 1e-5 for conjugate gradients, whose energies cannot tell more."""
     max_iterations: int | None = None
-    """Factorisations (2000), directions (200 000) or steps (2 000 000) that one lattice may take."""
+    """Factorisations (2000, on each load path tried), directions (200 000) or steps (2 000 000) that one lattice may take."""
     load_step: float = 0.1
-    """Newton: largest change of a stretch in one step along the load path [-]."""
+    """Newton: largest change of a stretch in one step along the load path, the first one tried [-]."""
     line_tolerance: float = 0.1
     """Conjugate gradients: change of the best step, over it, at which a line search ends [-]."""
     line_cap: int = 10
@@ -137,13 +139,37 @@ def imperfection_forces(design: Design, structure: Structure) -> Floats:
 
 
 def newton_search(problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None) -> Found:
-    """Newton along the load path, or from given positions; 8 lattices at a time in each thread's lanes."""
-    design, structure = problem.design, problem.structure
-    n, m = len(problem.stretches), len(structure.mass)
-    pattern = lattice_pattern(problem.lattice, int(design.bar_segments))
-    dead_load = imperfection_forces(design, structure)
-    gravity = problem.normal_gravity
-    settings = NewtonSettings(
+    """Newton along the load path, or from given positions.
+
+    A lattice that got lost on its load path is searched again with half the load step, ``TRIES`` times in all: soft bars under
+    their own weight lose one in sixteen, and on the finer path they arrive where the others do.
+    """
+    settings = newton_settings(problem, options)
+    records = newton_run(problem, settings, threads, progress)
+    evaluations = records.iterations.copy()
+    for _ in range(TRIES - 1 if problem.start is None else 0):
+        lost = np.flatnonzero(~records.converged)
+        settings = settings._replace(load_step=0.5 * settings.load_step)
+        again = newton_run(problem._replace(stretches=problem.stretches[lost]), settings, threads, None)
+        evaluations[lost] += again.iterations
+        for kept, new in zip(records, again, strict=True):
+            kept[lost] = new
+    return Found(
+        records.positions,
+        records.forces,
+        records.residual,
+        records.iterations,
+        evaluations,
+        records.converged,
+        settings.tolerance,
+        settings.max_iterations,
+    )
+
+
+def newton_settings(problem: Problem, options: SearchOptions) -> NewtonSettings:
+    """Newton's lengths, forces and stiffnesses, as shares of the design's."""
+    design = problem.design
+    return NewtonSettings(
         load_step=options.load_step,
         path_tolerance=0.02 * design.critical_load,
         tolerance=(options.tolerance or TOLERANCE) * design.critical_load,
@@ -157,6 +183,14 @@ def newton_search(problem: Problem, options: SearchOptions, threads: int | None,
         first_shift=0.01 * design.critical_load / design.bar_length,
         max_rounds=100,
     )
+
+
+def newton_run(problem: Problem, settings: NewtonSettings, threads: int | None, progress: Progress | None) -> EquilibriumRecords:
+    """One search for each of the problem's stretches, 8 lattices at a time in each thread's lanes, up to ``ALONE`` without."""
+    structure = problem.structure
+    n, m = len(problem.stretches), len(structure.mass)
+    pattern = lattice_pattern(problem.lattice, int(problem.design.bar_segments))
+    dead_load, gravity = imperfection_forces(problem.design, structure), problem.normal_gravity
     records = EquilibriumRecords(
         positions=problem.start_positions(),
         forces=np.zeros((n, m, 3)),
@@ -165,7 +199,6 @@ def newton_search(problem: Problem, options: SearchOptions, threads: int | None,
         converged=np.zeros(n, dtype=np.bool_),
         least_pivot=np.zeros(n),
     )
-
     count = 1 if n <= ALONE else lane_count(np.float64)
 
     def work(first: int, last: int, counter: np.ndarray) -> None:
@@ -176,16 +209,7 @@ def newton_search(problem: Problem, options: SearchOptions, threads: int | None,
         )
 
     run_shares(work, n, threads, count, progress)
-    return Found(
-        records.positions,
-        records.forces,
-        records.residual,
-        records.iterations,
-        records.iterations,
-        records.converged,
-        settings.tolerance,
-        settings.max_iterations,
-    )
+    return records
 
 
 def newton_lanes(n_masses: int, members: int, unloaded_length: Floats, n_slots: int, count: int) -> NewtonLanes:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import eigh
 from scipy.sparse import bsr_matrix, csr_matrix
 
+from tensegrity_gym.clearance import centreline_distance
 from tensegrity_gym.core.assembly import assemble_tangent
 from tensegrity_gym.design import Design
 from tensegrity_gym.elimination import lattice_pattern
@@ -36,6 +39,8 @@ class Stability:
     past_critical: np.ndarray  #: bars above their Euler load, count, shape (n,)
     bending_strain: Floats  #: largest strain at a bar's surface, as if its hinges' angles were spread over it [-], shape (n,)
     safety_margin: Floats  #: failure strain over that, minus one [-], shape (n,)
+    bar_clearance: Floats  #: least gap between the surfaces of two bars that share no node [m], shape (n,)
+    bars_touch: np.ndarray  #: warning: that gap is negative, the model's bars reach through each other, shape (n,)
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,36 @@ class LoadPath:
     shares: Floats  #: shape (k,)
     lowest: Floats  #: lowest eigenvalue, rigid and spin modes apart; NaN where no equilibrium was found [N/m], shape (k,)
     energy: Floats  #: [J], shape (k,)
-    distance: float  #: from share 1 to the nearest share without a stable equilibrium [-]; inf if none in the range looked at
+    clearance: Floats  #: least gap between two bars that share no node [m], shape (k,)
+    critical: Floats  #: shares at which the path loses stability or jumps, to ``tolerance`` below, ascending, shape (m,)
+    distance: float  #: from share 1 to the nearest of them [-]; inf if none in the range looked at
+
+
+State = TypeVar("State")
+
+
+def last_share(
+    solve: Callable[[float, State], State | None],
+    same: Callable[[State, State], bool],
+    low: float,
+    state: State,
+    high: float,
+    tolerance: float,
+) -> float:
+    """Share in (low, high) up to which the path of equilibria through ``state`` at ``low`` goes on, by bisection [-].
+
+    ``solve(share, state)`` is the stable equilibrium that a search from ``state`` finds, None if there is none. The path goes on
+    if the way back from it ends where it began: a snap-through does not.
+    """
+    while high - low > tolerance:
+        middle = 0.5 * (low + high)
+        new = solve(middle, state)
+        back = None if new is None else solve(low, new)
+        if new is not None and back is not None and same(back, state):
+            low, state = middle, new
+        else:
+            high = middle
+    return 0.5 * (low + high)
 
 
 def tangent_matrix(structure: Structure, pattern: BlockPattern, actuator_length: Floats, positions: Floats) -> csr_matrix:
@@ -107,6 +141,7 @@ def check_stability(
         for s, x, c in zip(equilibria.stretches, equilibria.positions, equilibria.contact_force, strict=True)
     ]
     angles = hinge_angles(equilibria.positions, structure.bars).max(axis=(1, 2), initial=0.0)
+    clearance = centreline_distance(equilibria.positions, structure.bars) - design.bar_diameter
     strain = angles / (design.bar_length / design.bar_segments) * design.bar_diameter / 2
     segments = np.linalg.norm(np.diff(equilibria.positions[:, structure.bars], axis=2), axis=-1)
     squeeze = structure.segment_stiffness[:, None] * (structure.segment_length[:, None] - segments)
@@ -121,6 +156,8 @@ def check_stability(
         past_critical=(ratio > 1.0).sum(axis=1),
         bending_strain=strain,
         safety_margin=failure_strain / np.maximum(strain, 1e-300) - 1.0,
+        bar_clearance=clearance,
+        bars_touch=clearance < 0.0,
     )
 
 
@@ -156,6 +193,10 @@ def _complement(vectors: Floats) -> Floats:
     return q[:, np.linalg.matrix_rank(vectors) :]
 
 
+#: Nodes that come back this near to where they were did not snap [m]; a found equilibrium is 1e-8 m off at most.
+SAME_PLACE = 1e-5
+
+
 def follow_load_path(
     stretches: Floats,
     *,
@@ -164,19 +205,60 @@ def follow_load_path(
     lattice: Lattice | None = None,
     reach: float = 1.4,
     points: int = 29,
+    tolerance: float = 1e-3,
 ) -> LoadPath:
     """Stability along the load path of one set of stretches, from unloaded past the target to ``reach`` times the load.
 
-    The distance counts backwards, too: near share 0.1 the bars buckle, where gravity and the imperfection round the corner.
+    Between two neighbours that are not joined by a reversible path of stable equilibria the share where it ends is closed in to
+    ``tolerance``. The distance counts backwards, too: near share 0.1 the bars buckle, where gravity and the imperfection round
+    the corner.
     """
     design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
     target = np.asarray(stretches, dtype=np.float64).ravel()
     shares = np.linspace(0.05, reach, points)
-    path = 1.0 + shares[:, None] * (target - 1.0)
-    inside = (path >= WIDEST_RANGE[0]).all(axis=1)
-    shares, path = shares[inside], path[inside]
-    found = form_find(path, design=design, scene=scene, lattice=lattice, outside=True)
+    inside = (_on_path(target, shares) >= WIDEST_RANGE[0]).all(axis=1)
+    shares = shares[inside]
+
+    def find(where: Floats, start: Floats | None = None) -> Equilibria:
+        path = _on_path(target, where)
+        return form_find(path, design=design, scene=scene, lattice=lattice, outside=True, start=start)
+
+    def solve(share: float, positions: Floats) -> Floats | None:
+        e = find(np.array([share]), positions[None])
+        good = check_stability(e, design=design, lattice=lattice, modes=1).stable[0]
+        return e.positions[0] if good else None
+
+    def same(a: Floats, b: Floats) -> bool:
+        return bool(np.abs(a[: lattice.n_nodes] - b[: lattice.n_nodes]).max() < SAME_PLACE)
+
+    found = find(shares)
     check = check_stability(found, design=design, lattice=lattice, modes=1)
-    lost = ~check.stable
-    distance = float(np.abs(shares[lost] - 1.0).min()) if lost.any() else float("inf")
-    return LoadPath(shares, np.where(found.converged, check.eigenvalues[:, 0], np.nan), found.energy, distance)
+    back = find(shares[:-1], found.positions[1:])
+    critical = []
+    for k in range(len(shares) - 1):
+        both = check.stable[k] and check.stable[k + 1]
+        if both and back.converged[k] and same(back.positions[k], found.positions[k]):
+            continue
+        if check.stable[k]:
+            critical.append(last_share(solve, same, shares[k], found.positions[k], shares[k + 1], tolerance))
+        elif check.stable[k + 1]:
+            critical.append(-last_share(_mirrored(solve), same, -shares[k + 1], found.positions[k + 1], -shares[k], tolerance))
+    distance = float(np.abs(np.array(critical) - 1.0).min()) if critical else float("inf")
+    return LoadPath(
+        shares,
+        np.where(found.converged, check.eigenvalues[:, 0], np.nan),
+        found.energy,
+        check.bar_clearance,
+        np.array(critical),
+        distance,
+    )
+
+
+def _on_path(target: Floats, shares: Floats) -> Floats:
+    """Stretches at shares of the load path, shape (k, n_actuators)."""
+    return 1.0 + shares[:, None] * (target - 1.0)
+
+
+def _mirrored(solve: Callable[[float, State], State | None]) -> Callable[[float, State], State | None]:
+    """The path walked backwards: the same search at minus the share."""
+    return lambda share, state: solve(-share, state)

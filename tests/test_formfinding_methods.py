@@ -237,6 +237,25 @@ def test_outside_the_range_is_refused_unless_asked_for(stretch: float) -> None:
     assert e.converged.all() or "leave [0.2, 0.8]" in e.hints[0]
 
 
+def test_a_lattice_lost_on_its_load_path_is_found_on_a_finer_one() -> None:
+    """The lattice weighs 2.7 Euler loads of these soft bars; the path of steps of 0.1 loses this one."""
+    design, stretches = Design(bar_modulus=1e10), np.random.default_rng(1).uniform(0.2, 0.8, size=(4, 4))[3]
+    e = form_find(stretches, design=design)
+    fine = form_find(stretches, design=design, options=SearchOptions(load_step=0.02))
+    assert e.converged.all()
+    assert e.evaluations[0] > 2000 > e.iterations[0]
+    assert e.energy[0] == pytest.approx(fine.energy[0], abs=1e-9)
+
+
+@pytest.mark.parametrize(("diameter", "found"), [(2e-3, True), (1e-3, False)])
+def test_bars_too_thin_for_the_lattices_weight_are_not_found(diameter: float, found: bool) -> None:
+    """It weighs 1.9 Euler loads of 2 mm bars, and 25 of 1 mm bars, which let it lie down flat."""
+    stretches = np.random.default_rng(1).uniform(0.2, 0.8, size=(8, 4))
+    e = form_find(stretches, design=Design(bar_diameter=diameter))
+    assert e.converged.all() == found
+    assert all(("residual" in hint) != ok for hint, ok in zip(e.hints, e.converged, strict=True))
+
+
 def test_bad_options_are_refused() -> None:
     with pytest.raises(InvalidParameterError, match="damping"):
         form_find(STRETCHES, lattice=CELL, method="relaxation", options=SearchOptions(damping="air"))

@@ -12,6 +12,7 @@ from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import load, load1, select, sqrt, store
 from tensegrity_gym.core.newton import EquilibriumRecords, NewtonSettings, find_minima
 from tensegrity_gym.searches import newton_lanes, without_lanes
+from tensegrity_gym.stability import last_share
 from tensegrity_gym.types import BlockPattern
 
 NO = np.zeros(0, dtype=np.int64)
@@ -268,6 +269,20 @@ def test_the_truss_above_its_limit_load_has_snapped_through(share: float) -> Non
     expected = brentq(lambda z: load_at(z) - load, -2.0, -0.3, xtol=1e-15)
     assert found.converged.all()
     assert found.positions[0, 0, 2] - BASE == pytest.approx(expected, abs=1e-8)
+
+
+def test_bisection_closes_in_on_the_limit_load() -> None:
+    """Above it Newton finds an equilibrium, too, the snapped one: that the way back does not end at the start tells."""
+    careful = SETTINGS._replace(unload=0.0, longest_step=0.02)
+
+    def solve(load: float, height: float) -> float | None:
+        found = search(run_truss, [[0.0, 0.0, height]], [load], careful)
+        return float(found.positions[0, 0, 2]) if found.converged[0] else None
+
+    start = solve(0.5 * LIMIT_LOAD, BASE + 0.3)
+    assert start is not None
+    found = last_share(solve, lambda a, b: abs(a - b) < 1e-6, 0.5 * LIMIT_LOAD, start, 1.5 * LIMIT_LOAD, 1e-5 * LIMIT_LOAD)
+    assert found == pytest.approx(LIMIT_LOAD, rel=1e-4)
 
 
 def test_a_cap_below_what_is_needed_is_reported() -> None:

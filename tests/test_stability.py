@@ -8,11 +8,13 @@ from functools import lru_cache
 import naive
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from tensegrity_gym import Design, Equilibria, Lattice, form_find
 from tensegrity_gym.core.assembly import assemble_tangent
-from tensegrity_gym.elimination import lattice_pattern
-from tensegrity_gym.stability import check_stability, follow_load_path, rigid_motions, spin_motions, tangent_matrix
+from tensegrity_gym.elimination import block_pattern, lattice_pattern
+from tensegrity_gym.stability import check_stability, follow_load_path, last_share, rigid_motions, spin_motions, tangent_matrix
+from tensegrity_gym.types import Structure
 
 CELL, DESIGN = Lattice(1, 1), Design()
 STRUCTURE = DESIGN.structure(CELL)
@@ -82,6 +84,69 @@ def test_straight_bars_are_stable_below_their_euler_load_and_not_above(share: fl
 
 def test_load_path_has_no_bifurcation_near_the_target() -> None:
     path = follow_load_path([0.5], lattice=CELL, points=8)
-    assert path.distance > 0.2
+    assert path.critical.shape == (0,)
+    assert path.distance == np.inf
     assert np.isfinite(path.lowest).all()
     assert (np.diff(path.energy) > 0).all()
+    assert (path.clearance < path.clearance[0]).sum() == len(path.clearance) - 1  # bars come nearer
+
+
+def straight_bar() -> Structure:
+    """A bar of thirds, its ends masses 0 and 1; the cable and the actuator hang slack."""
+    stiffness = np.array([3 * DESIGN.bar_rigidity / DESIGN.bar_length])
+    return Structure(
+        mass=np.ones(4),
+        inverse_mass=np.ones(4),
+        cables=np.array([[0, 1]]),
+        cable_stiffness=np.ones(1),
+        cable_length=np.array([2.0]),
+        cable_damping=np.zeros(1),
+        actuators=np.array([[0, 1]]),
+        actuator_rigidity=np.ones(1),
+        actuator_length=np.array([2.0]),
+        actuator_damping=np.zeros(1),
+        bars=np.array([[0, 2, 3, 1]]),
+        segment_stiffness=stiffness,
+        segment_length=np.array([DESIGN.bar_length / 3]),
+        segment_damping=np.zeros(1),
+        hinge_stiffness=np.array([DESIGN.hinge_stiffness]),
+        hinge_damping=np.zeros(1),
+    )
+
+
+def test_bisection_closes_in_on_the_euler_load_of_one_bar() -> None:
+    """Bent by y, the chain stores kappa y^2 / l^2 and its ends come nearer by y^2 / l: P l = kappa at the load where it buckles.
+
+    l = (L / 3)(1 - P / EA), so P (1 - P / EA) = pi^2 E I / L^2.
+    """
+    structure = straight_bar()
+    pattern = block_pattern(structure.cables, structure.actuators, structure.bars, 4)
+
+    def straight(load: float, _: float) -> float | None:
+        x = np.zeros((4, 3))
+        x[[0, 2, 3, 1], 0] = np.linspace(0.0, DESIGN.bar_length * (1 - load / DESIGN.bar_rigidity), 4)
+        inner = tangent_matrix(structure, pattern, structure.actuator_length, x).toarray()[6:, 6:]
+        return load if np.linalg.eigvalsh(inner)[0] > 0 else None
+
+    euler, rigidity = DESIGN.critical_load, DESIGN.bar_rigidity
+    expected = brentq(lambda p: p * (1 - p / rigidity) - euler, 0.5 * euler, 2 * euler, xtol=1e-12)
+    found = last_share(straight, lambda a, b: True, 0.0, 0.0, 2 * euler, 1e-6 * euler)
+    assert found == pytest.approx(expected, abs=1e-6 * euler)
+    assert found == pytest.approx(euler, rel=1e-4)
+
+
+def test_a_path_without_an_end_is_followed_to_the_top() -> None:
+    assert last_share(lambda share, state: state, lambda a, b: True, 0.0, 0.0, 1.0, 1e-3) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_jump_ends_a_path_though_every_search_finds_an_equilibrium() -> None:
+    """A hysteresis loop: up to 0.7 the state stays 0, above it becomes 1 and never comes back."""
+    found = last_share(lambda share, state: 1.0 if share > 0.7 else state, lambda a, b: a == b, 0.0, 0.0, 1.0, 1e-6)
+    assert found == pytest.approx(0.7, abs=1e-6)
+
+
+@pytest.mark.parametrize(("stretch", "touch"), [(0.7, False), (0.4, True)])
+def test_bars_that_reach_through_each_other_are_reported(stretch: float, touch: bool) -> None:
+    s = check_stability(form_find([[stretch]], lattice=CELL), lattice=CELL, modes=1)
+    assert s.bars_touch[0] == touch
+    assert (s.bar_clearance[0] < 0) == touch
