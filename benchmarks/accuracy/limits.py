@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from benchmarks.accuracy.part import Data, Options, Part, kept, table
 from benchmarks.accuracy.samples import stretches
 from tensegrity_gym import Design, HopStatus, Lattice, Scene, form_find, simulate
-from tensegrity_gym.simulate import LEAST_RISE
+from tensegrity_gym.rollouts import LEAST_RISE
 from tensegrity_gym.timestep import critical_time_step, default_time_step
 from tensegrity_gym.types import Floats
 
