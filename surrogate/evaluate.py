@@ -1,23 +1,26 @@
-"""How far the surrogate's predictions are from simulated hops."""
+"""How far the surrogate's predictions are from simulated hops, how sure it should be, how fast it is, and pictures of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from surrogate import dataset, model
-from surrogate.dataset import SPLITS
-from surrogate.outputs import OUTPUTS
-from surrogate.scores import rmse, spread
+from surrogate.dataset import SPLITS, HopData
+from surrogate.model import HopNet
+from surrogate.outputs import OUTPUTS, target_columns
+from surrogate.scores import LEVELS, PLANES, coverage, disagreement, nearest_hop_noise, of_data, ranking, rmse, speed, spread
+from surrogate.storage import ensure_folder, write_json
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """RMSE of a trained surrogate on one split of a file of hops."""
+    """Errors, calibration and speed of a trained surrogate on one split of a file of hops."""
 
     model: Annotated[Path, tyro.conf.Positional]
     """Checkpoint made by `python -m surrogate train`."""
@@ -25,13 +28,74 @@ class EvaluateConfig:
     """HDF5 file of hops."""
     split: str = "test"
     """train, validation, test, or all (for a file that was not trained on)."""
+    out: Path | None = None
+    """Folder for evaluation.json and pictures; None: print only."""
+    floor: int = 0
+    """Simulate so many of the hops again from starts 10 um off, and give errors in multiples of how far that moves them."""
+    studies: tuple[Literal["sizes", "nets", "symmetry", "ballistic"], ...] = ()
+    """Train other nets on the same file, into --out: error against data size, widths and depths, ablations; resumable."""
+    study_steps: int = 3000
+    """Gradient steps of each of the studies' trainings (of one member each)."""
 
 
-def main(config: EvaluateConfig) -> None:
-    """Entry of ``python -m surrogate evaluate``."""
-    net, card = model.load(config.model)
-    data = dataset.read(config.data)
-    for name in ("model_version", "design", "scene", "lattice"):
+@dataclass(frozen=True)
+class Evaluation:
+    """What `evaluate` found; its fields are the JSON's."""
+
+    split: str
+    hops: int
+    rmse: dict[str, float]
+    spread: dict[str, float]
+    nearest_hop_noise: dict[str, float]
+    levels: list[float]
+    coverage: dict[str, list[float]]
+    coverage_gap: dict[str, float]
+    ranking: dict[str, dict[str, float]]
+    distance: dict[str, dict[str, float]]
+    reach: dict[str, float]
+    speed: dict[str, Any]
+    floor: dict[str, dict[str, float]] = field(default_factory=dict)
+
+
+def evaluate(net: HopNet, rows: HopData, whole: HopData, split: str, floor: int = 0) -> Evaluation:
+    """All numbers about ``net`` on the hops ``rows``, a split of ``whole``."""
+    prediction, targets = of_data(net, rows), target_columns(rows)
+    covered = coverage(prediction, targets)
+    distance, reach = {}, {}
+    for name, (x, y) in PLANES.items():
+        error = np.hypot(*(prediction.mean - targets)[:, [x, y]].T)
+        error = error[np.isfinite(error)]
+        distance[name] = {
+            "rms": float(np.sqrt((error**2).mean())),
+            **{f"p{q}": float(np.percentile(error, q)) for q in (50, 90, 99)},
+        }
+        reach[name] = float(np.nanpercentile(np.hypot(targets[:, x], targets[:, y]), 95))
+    measured: dict[str, dict[str, float]] = {}
+    if floor:
+        from surrogate.floor import measure_floor
+
+        measured = measure_floor(whole, floor)
+    names = [o.name for o in OUTPUTS]
+    return Evaluation(
+        split=split,
+        hops=len(rows),
+        rmse=rmse(net, rows),
+        spread=spread(rows),
+        nearest_hop_noise=nearest_hop_noise(whole),
+        levels=LEVELS.tolist(),
+        coverage={name: covered[:, k].tolist() for k, name in enumerate(names)},
+        coverage_gap={name: float(np.abs(covered[:, k] - LEVELS).max()) for k, name in enumerate(names)},
+        ranking=ranking(prediction, disagreement(net, rows), targets),
+        distance=distance,
+        reach=reach,
+        speed=speed(net),
+        floor=measured,
+    )
+
+
+def rows_of(config: EvaluateConfig, data: HopData, card: dict[str, Any]) -> HopData:
+    """The hops that ``config.split`` names; DataFileError where the net was trained on another configuration."""
+    for name in ("model_version", "design", "scene", "lattice", "scene_ranges"):
         if card["configuration"].get(name) != data.configuration.get(name):
             raise DataFileError(
                 f"{config.data}: expected {name} {card['configuration'].get(name)!r}, which the surrogate was trained on, "
@@ -47,7 +111,49 @@ def main(config: EvaluateConfig) -> None:
         raise InvalidParameterError(
             f"split: expected at least one hop in {config.split!r}, got none of {len(data)}; use more hops"
         )
-    errors, spreads = rmse(net, rows), spread(rows)
-    print(f"{config.split}: {len(rows)} hops\n{'output':<20}{'RMSE':>10}{'spread':>10}  unit")
+    return rows
+
+
+def table(found: Evaluation) -> str:
+    """The numbers as text, one output a line."""
+    floor = found.floor.get("start moved by 1e-05 m", {})
+    head = f"{'output':<20}{'RMSE':>10}{'spread':>10}{'noise':>10}{'floor':>10}{'x floor':>9}{'coverage':>10}  unit"
+    lines = [f"{found.split}: {found.hops} hops", head]
     for output in OUTPUTS:
-        print(f"{output.name:<20}{errors[output.name]:>10.4f}{spreads[output.name]:>10.4f}  {output.unit}")
+        name, least = output.name, floor.get(output.name, float("nan"))
+        lines.append(
+            f"{name:<20}{found.rmse[name]:>10.5f}{found.spread[name]:>10.5f}{found.nearest_hop_noise[name]:>10.5f}"
+            f"{least:>10.5f}{found.rmse[name] / least:>9.1f}{100 * found.coverage_gap[name]:>8.1f} %  {output.unit}"
+        )
+    for name, values in found.distance.items():
+        lines.append(
+            f"{name} error: rms {1e3 * values['rms']:.2f} mm, median {1e3 * values['p50']:.2f}, 90 % {1e3 * values['p90']:.2f}; "
+            f"{100 * values['rms'] / found.reach[name]:.1f} % of reach ({found.reach[name]:.3f} m); Spearman of error with "
+            + ", ".join(f"{kind} {value:.2f}" for kind, value in found.ranking[name].items())
+        )
+    member, whole = (found.speed[f"predictions_per_second_{k}"] for k in ("member", "ensemble"))
+    lines.append(
+        f"a second of one core: {member:.3g} predictions of one member, {whole:.3g} of all; a single one takes "
+        f"{found.speed['single_milliseconds']:.2f} ms"
+    )
+    return "\n".join(lines)
+
+
+def main(config: EvaluateConfig) -> None:
+    """Entry of ``python -m surrogate evaluate``."""
+    net, card = model.load(config.model)
+    data = dataset.read(config.data)
+    rows = rows_of(config, data, card)
+    if config.studies and config.out is None:
+        raise InvalidParameterError("studies: expected a folder to keep them in, got none; give --out")
+    found = evaluate(net, rows, data, config.split, config.floor)
+    print(table(found))
+    if config.out is None:
+        return
+    from surrogate import evaluation_figures, studies
+
+    ensure_folder(config.out)
+    results = studies.run(config.studies, data, config.out, config.study_steps)
+    write_json(config.out / "evaluation.json", {**vars(found), "card": card, "studies": results})
+    for path in evaluation_figures.draw(net, rows, found, results, config.out):
+        print(path)
