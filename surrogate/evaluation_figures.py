@@ -117,7 +117,7 @@ def data_size(cells: dict[str, Any], found: Evaluation) -> Figure:
         axis.loglog(hops, 1e3 * error, "o-", color=COLOURS[k], label=f"{name}: falls as hops to the {slope:.2f}")
         axis.axhline(10 * found.reach[name], color=COLOURS[k], lw=1, ls=":", label=f"1 % of {name}'s reach")
         if found.floor:
-            least = float(np.hypot(*(found.floor[FLOOR][OUTPUTS[i].name] for i in (x, y))))
+            least = float(np.hypot(found.floor[FLOOR][OUTPUTS[x].name], found.floor[FLOOR][OUTPUTS[y].name]))
             axis.axhline(1e3 * least, color=COLOURS[k], lw=1, ls="--", label=f"{name}'s floor (rms)")
     axis.set(xlabel="hops trained on", ylabel="rms error of test hops [mm]")
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5))
@@ -150,7 +150,7 @@ def roughness(found: Evaluation) -> Figure:
         apart = [1e3 * float(np.hypot(v[OUTPUTS[x].name], v[OUTPUTS[y].name])) for v in steps.values()]
         axis.loglog(list(steps), apart, "o-", color=COLOURS[k], label=f"{name}: departure from a line")
         axis.axhline(1e3 * found.distance[name]["rms"], color=COLOURS[k], ls=":", lw=1, label=f"{name}: surrogate's error")
-        least = float(np.hypot(*(found.floor[FLOOR][OUTPUTS[i].name] for i in (x, y))))
+        least = float(np.hypot(found.floor[FLOOR][OUTPUTS[x].name], found.floor[FLOOR][OUTPUTS[y].name]))
         axis.axhline(1e3 * least, color=COLOURS[k], lw=1, ls="--", label=f"{name}: floor")
     axis.set(xlabel="distance of neighbours' stretches [-]", ylabel="rms [mm]")
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5))

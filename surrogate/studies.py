@@ -49,7 +49,7 @@ def run(studies: Iterable[str], data: HopData, folder: Path, steps: int) -> dict
     """Results by study and cell; those already in ``folder`` are read, not trained again."""
     results: dict[str, dict[str, Any]] = {}
     for study in studies:
-        results[study] = {name: _cell(folder, data, *cell) for name, *cell in cells_of(study, data, steps)}
+        results[study] = {name: _cell(folder, data, config, n) for name, config, n in cells_of(study, data, steps)}
     return results
 
 
