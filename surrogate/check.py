@@ -16,10 +16,13 @@ from surrogate.hops import Configuration, HopData, split_share
 from surrogate.schema import SCHEMA_VERSION, columns_of
 from tensegrity_gym import ENERGY_NAMES, STRETCH_RANGE, Design, HopStatus, Lattice, Scene
 from tensegrity_gym.errors import DataFileError
+from tensegrity_gym.events import flew
+from tensegrity_gym.fidelity import Fidelity
+from tensegrity_gym.hops import time_step
 
-#: Largest departure of the energies' sum from constant, over the stored energy. Default steps close to 3e-4, 48 hops, Earth;
-#: four times that may pass at twice the step. In float32, ``rounding_heat`` comes on top.
-CLOSURE = 2e-3
+#: Largest departure of the energies' sum from constant, over the stored energy: this at steps of 20 us, where we see 3e-4, and
+#: as the square of longer steps. In float32, ``rounding_heat`` comes on top.
+CLOSURE, CLOSURE_STEP = 2e-3, 2e-5
 #: Largest disagreement of heights that energies and flight imply [m]: a step's fall at touchdown speed, and rounding.
 HEIGHT = {"float64": 3e-4, "float32": 1e-3}
 TAKEOFF, TOUCHDOWN, END = 1, 2, 3
@@ -71,7 +74,7 @@ def _attributes(file: h5py.File, data: HopData) -> Iterator[str]:
     for what, value in fields:
         if file.attrs.get(what) != value:
             yield f"attribute {what}: expected {value!r}, got {file.attrs.get(what)!r}"
-    for what in ("command", "date", "packages", "skipped", "design", "scene"):
+    for what in ("command", "date", "packages", "skipped", *(k for k in dataset.PARTS if k in data.configuration)):
         if what not in file.attrs:
             yield f"attribute {what}: missing"
 
@@ -92,7 +95,12 @@ Rule = Callable[[HopData], np.ndarray]
 
 
 def _finite(data: HopData) -> np.ndarray:
-    return np.logical_and.reduce([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in data.columns.values()])
+    stopped = _stopped(data)
+    good = np.ones(len(data), dtype=bool)
+    for name, values in data.columns.items():
+        finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        good &= np.where(stopped, ~finite, finite) if name in ("rest", "rest_nodes") else finite
+    return good
 
 
 def _ascending(data: HopData) -> np.ndarray:
@@ -140,7 +148,12 @@ def _status(data: HopData) -> np.ndarray:
 
 
 def _flew(data: HopData) -> np.ndarray:
-    return data["status"] <= HopStatus.TIME_LIMIT
+    return flew(data["status"])
+
+
+def _stopped(data: HopData) -> np.ndarray:
+    """Hops that were not followed to rest, which they then have none of."""
+    return data.columns.get("status", np.zeros(len(data))) == HopStatus.STOPPED
 
 
 def _times(data: HopData) -> np.ndarray:
@@ -159,7 +172,7 @@ def _flight_time(data: HopData) -> np.ndarray:
 def _steps(data: HopData) -> np.ndarray:
     """All hops of a file take one step, so steps and time are proportional."""
     going = (data["steps"] > 0) & data.usable
-    if not going.any():
+    if not going.any() or _configuration(data).model.flight == "rigid":  # which takes no steps
         return np.ones(len(data), dtype=bool)
     dt = np.median(data["end_time"][going] / data["steps"][going])
     return ~going | (np.abs(data["end_time"] / dt - data["steps"]) < 1.0 + 1e-5 * data["steps"])
@@ -174,7 +187,7 @@ def _nodes_near(data: HopData) -> np.ndarray:
     lattice = Lattice(**data.configuration["lattice"])
     size = Design(**data.configuration["design"]).cell_height * max(lattice.nx, lattice.ny)
     near = [np.linalg.norm(data[k] - data[f"{k}_nodes"], axis=1) < 0.5 * size for k in ("rest", "touchdown")]
-    return near[0] & near[1]
+    return (near[0] | _stopped(data)) & near[1]
 
 
 def _closure(data: HopData) -> np.ndarray:
@@ -182,7 +195,10 @@ def _closure(data: HopData) -> np.ndarray:
     reached = np.ones(total.shape, dtype=bool)
     reached[:, (TAKEOFF, TOUCHDOWN)] = _flew(data)[:, None]  # events that a hop without flight never had
     drift = np.where(reached, np.abs(total - total[:, :1]), 0.0).max(axis=1)
-    return (drift < CLOSURE * data["stored_energy"] + rounding_heat(data)) | ~data.usable
+    c = _configuration(data)
+    dt = time_step(c.dt, c.modelled, c.lattice, c.model, allow_unstable=True)
+    share = CLOSURE * max(1.0, dt / CLOSURE_STEP) ** 2
+    return (drift < share * data["stored_energy"] + rounding_heat(data)) | ~data.usable
 
 
 def rounding_heat(data: HopData) -> np.ndarray:
@@ -192,12 +208,13 @@ def rounding_heat(data: HopData) -> np.ndarray:
     variance u^2 / 12 at either end of a member, k u^2 / 12 of elastic energy in it. A tenth of that is the most that we see, from
     Earth to the Moon and on slopes of up to 30 degrees (farthest is not where a hop is all the time); a quarter may pass.
     """
-    if data.configuration["precision"] != "float32":
+    configuration = _configuration(data)
+    if configuration.model.precision != "float32":
         return np.zeros(len(data))
-    design, lattice = Design(**data.configuration["design"]), Lattice(**data.configuration["lattice"])
+    design, lattice = configuration.modelled, configuration.lattice
     structure = design.structure(lattice)
     stiffness = design.bar_segments * structure.segment_stiffness.sum() + structure.cable_stiffness.sum()
-    away = [np.linalg.norm(data[name], axis=1) for name in ("rest", "touchdown")]
+    away = [np.nan_to_num(np.linalg.norm(data[name], axis=1)) for name in ("rest", "touchdown")]
     farthest = np.maximum.reduce([*away, data["apex"]]) + design.cell_height * max(lattice.nx, lattice.ny)
     return data["steps"] * stiffness * (2.0**-23 * farthest) ** 2 / 12 / 4
 
@@ -259,13 +276,14 @@ def _gravity(data: HopData) -> np.ndarray:
 
 
 def _mass(data: HopData) -> float:
-    design, lattice = Design(**data.configuration["design"]), Lattice(**data.configuration["lattice"])
-    return float(design.structure(lattice).mass.sum())
+    configuration = _configuration(data)
+    return float(configuration.modelled.structure(configuration.lattice).mass.sum())
 
 
 def _configuration(data: HopData) -> Configuration:
     plain = {k: v for k, v in data.configuration.items() if k not in ("schema_version", "model_version")}
-    made = {k: kind(**plain[k]) for k, kind in (("design", Design), ("scene", Scene), ("lattice", Lattice))}
+    kinds: tuple[tuple[str, Any], ...] = (("design", Design), ("scene", Scene), ("lattice", Lattice), ("fidelity", Fidelity))
+    made = {k: kind(**plain[k]) for k, kind in kinds if k in plain}
     return Configuration(**(plain | made))
 
 

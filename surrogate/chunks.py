@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -61,19 +61,19 @@ def _one_scene(
 ) -> HopData:
     wall, cpu = time.perf_counter(), time.process_time()
     scene = replace(configuration.scene, **values)  # type: ignore[arg-type]
-    common = {"design": configuration.design, "scene": scene, "lattice": configuration.lattice, "threads": threads}
+    common: dict[str, Any] = {"scene": scene, "lattice": configuration.lattice, "threads": threads, "progress": progress}
     if configuration.content == "equilibria":
-        found = form_find(stretches, progress=progress, **common)  # type: ignore[arg-type]
+        found = form_find(stretches, design=configuration.modelled, **common)
         make, result = from_equilibria, found
     else:
         rate = None if configuration.trajectory == "none" else configuration.trajectory_rate
         result = simulate(  # type: ignore[assignment]
             stretches,
+            design=configuration.design,
+            fidelity=configuration.model,
             dt=configuration.dt,
-            precision=configuration.precision,
             trajectory_rate=rate,
-            progress=progress,
-            **common,  # type: ignore[arg-type]
+            **common,
         )
         make = from_result  # type: ignore[assignment]
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

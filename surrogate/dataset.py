@@ -57,6 +57,8 @@ __all__ = [
 ]
 
 SEAL_BYTES = 512
+#: Parts of the configuration that are root attributes of their own, as JSON.
+PARTS = ("design", "scene", "fidelity")
 
 
 def write(path: Path | str, data: HopData) -> Path:
@@ -88,7 +90,7 @@ def write_blocks(
                     "wall_seconds": seconds,
                     "configuration": json.dumps(configuration, sort_keys=True),
                     "configuration_hash": hash_of(configuration),
-                    **{k: json.dumps(configuration[k], sort_keys=True) for k in ("design", "scene")},
+                    **{k: json.dumps(configuration[k], sort_keys=True) for k in PARTS if k in configuration},
                     **{k: configuration[k] for k in ("precision", "seed")},
                     "packages": json.dumps(package_versions()),
                     "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),

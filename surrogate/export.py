@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -126,15 +126,15 @@ def to_minari(path: Path, folder: Path) -> None:
 def _env_arguments(configuration: dict[str, Any]) -> dict[str, Any]:
     """Arguments of the env that makes these hops; InvalidParameterError where none does."""
     ranges = configuration["scene_ranges"]
-    foreign = [k for k, made in (("design", Design()), ("lattice", Lattice(2, 2))) if configuration[k] != asdict(made)]
+    foreign = [k for k, made in (("design", Design()), ("lattice", Lattice(2, 2))) if type(made)(**configuration[k]) != made]
     foreign += [f"ranges of {name}" for name in ranges if name not in SCENE_VALUES]
     if foreign:
         raise InvalidParameterError(
             f"--minari: expected hops that TensegrityHop-v0 can make, got other {' and '.join(foreign)}; export .csv or .parquet"
         )
-    levers = {k: configuration[k] for k in ("dt", "precision") if configuration[k] is not None}
+    levers = {k: configuration[k] for k in ("dt", "precision")} | configuration.get("fidelity", {})
     values = {k: low if low == high else [low, high] for k, (low, high) in ranges.items()}
-    return {"scene": configuration["scene"] | values, "fidelity": levers}
+    return {"scene": configuration["scene"] | values, "fidelity": {k: value for k, value in levers.items() if value is not None}}
 
 
 def _observations(part: HopData, task: HopTask) -> np.ndarray:

@@ -13,6 +13,7 @@ from surrogate.schema import EVENTS
 from surrogate.storage import atomic_path
 from tensegrity_gym import ENERGY_NAMES, STRETCH_RANGE, HopStatus
 from tensegrity_gym.errors import MissingExtraError
+from tensegrity_gym.events import flew
 from tensegrity_gym.types import Floats
 
 try:
@@ -60,12 +61,18 @@ def reach_by_direction(landing: Floats, sectors: int = SECTORS) -> tuple[Floats,
     return np.arange(sectors) * width, high, top
 
 
+def places(data: HopData) -> list[str]:
+    """Where hops landed: "rest", unless they were not followed so far, and "touchdown"."""
+    return [name for name in ("rest", "touchdown") if np.isfinite(data[name]).all()]
+
+
 def landing_map(data: HopData) -> Figure:
     """Rest and touchdown, coloured by the alternating sum of the stretches (the paper's figure)."""
     colour = alternating(data["stretches"])
-    figure, axes = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
+    names = places(data)
+    figure, axes = plt.subplots(1, len(names), figsize=(6 * len(names), 5.4), layout="constrained", squeeze=False)
     size = float(np.clip(4e4 / max(len(data), 1), 3, 26))
-    for axis, name in zip(axes, ("rest", "touchdown"), strict=True):
+    for axis, name in zip(axes[0], names, strict=True):
         dots = axis.scatter(*data[name].T, c=colour, cmap="coolwarm", vmin=-1.2, vmax=1.2, s=size, linewidths=0)
         axis.plot(0, 0, "+", color="black", ms=10)
         side = 1.05 * float(np.abs(data[name]).max() or 1.0)
@@ -77,8 +84,12 @@ def landing_map(data: HopData) -> Figure:
 
 def reach(data: HopData) -> Figure:
     """How far hops go in each direction."""
-    figure, axes = plt.subplots(1, 2, figsize=(11, 5), subplot_kw={"projection": "polar"}, layout="constrained")
-    for axis, name in zip(axes, ("rest", "touchdown"), strict=True):
+    names = places(data)
+    polar = {"projection": "polar"}
+    figure, axes = plt.subplots(
+        1, len(names), figsize=(5.5 * len(names), 5), subplot_kw=polar, layout="constrained", squeeze=False
+    )
+    for axis, name in zip(axes[0], names, strict=True):
         middle, high, top = reach_by_direction(data[name])
         around = np.append(middle, middle[0] + 2 * np.pi)
         axis.fill(around, np.append(high, high[0]), color=COLOURS[0], alpha=0.25, label="95 % of hops")
@@ -86,7 +97,7 @@ def reach(data: HopData) -> Figure:
         axis.plot(around, np.append(top, top[0]), color=COLOURS[5], lw=1.5, label="farthest hop")
         axis.set_title(f"{name}: distance [m] by direction")
         axis.set_rlabel_position(22.5)
-    axes[1].legend(loc="lower left", bbox_to_anchor=(0.9, 0.9))
+    axes[0, -1].legend(loc="lower left", bbox_to_anchor=(0.9, 0.9))
     return figure
 
 
@@ -103,12 +114,12 @@ def apex(data: HopData) -> Figure:
 
 def energies(data: HopData) -> Figure:
     """Where the stored energy is at each event, mean over hops that flew."""
-    flew = data.rows(data["status"] <= HopStatus.TIME_LIMIT)
-    share = flew["energies"] / flew["stored_energy"][:, None, None]
+    up = data.rows(flew(data["status"]))
+    share = up["energies"] / up["stored_energy"][:, None, None]
     # gravitational energy counts from the start of the hop
     lift = ENERGY_NAMES.index("gravitational")
     share[:, :, lift] -= share[:, :1, lift].copy()
-    mean = 100 * share.mean(axis=0) if len(flew) else np.zeros((len(EVENTS), len(ENERGY_NAMES)))
+    mean = 100 * share.mean(axis=0) if len(up) else np.zeros((len(EVENTS), len(ENERGY_NAMES)))
     figure, axis = plt.subplots(figsize=(9, 4.6), layout="constrained")
     bottom = np.zeros(len(EVENTS))
     for k, name in enumerate(ENERGY_NAMES):

@@ -21,7 +21,9 @@ from surrogate.sampling import read_stretches, sample_size, sample_stretches, st
 from surrogate.schedule import Outcome, run_here, run_on_cluster
 from surrogate.storage import ensure_folder, remove_partials, writer_lock
 from tensegrity_gym import Design, Lattice, Scene
+from tensegrity_gym.auto import choose_fidelity
 from tensegrity_gym.errors import InvalidParameterError, SkippedChunksError
+from tensegrity_gym.fidelity import Fidelity, changed, named_fidelity
 from tensegrity_gym.types import Floats
 
 __all__ = ["GenerateConfig", "fill", "generate", "main", "sample_stretches"]
@@ -61,8 +63,15 @@ class GenerateConfig:
     """Values of the scene that vary: gravity=1.6:9.8 friction=0.3:0.8 ..."""
     design: Design = field(default_factory=Design)
     """Materials and sizes."""
-    precision: str = "float32"
-    """Of the simulator's lanes. float32 is twice as fast and moves a landing by less than its floor; float64 is exact."""
+    fidelity: str = "paper"
+    """paper, reference (converged in time), or auto: the cheapest model known to hold --tolerance."""
+    tolerance: float | None = None
+    """On the landing, with --fidelity auto [m]; None: the scene's floor."""
+    stop: str | None = None
+    """landing: follow hops no further than where landings are read, so that --landing touchdown has no rest; rest."""
+    precision: str | None = None
+    """Of the simulator's lanes; None: float32 with --fidelity paper, which is twice as fast as float64 and moves a landing by
+    less than its floor; else the fidelity's."""
     dt: float | None = None
     """Time step [s]; None lets the simulator choose."""
     symmetry: bool = False
@@ -216,16 +225,17 @@ def configuration_of(config: GenerateConfig) -> tuple[Configuration, Floats | No
     default = {"grid": config.grid**lattice.n_cells, "file": 0 if stretches is None else len(stretches)}.get(sampler, 10_000)
     hops = default - (config.first if sampler in ("grid", "file") else 0) if config.hops is None else config.hops
     size = {"lhs": config.first + hops, "grid": config.grid, "file": default}.get(sampler, 0)
+    scene = Scene.preset(config.scene, **changes)
     configuration = Configuration(
         design=config.design,
-        scene=Scene.preset(config.scene, **changes),
+        scene=scene,
         lattice=lattice,
         seed=config.seed,
         sampler=sampler,
         sampler_size=size,
         stretches_hash="" if stretches is None else stretches_hash(stretches),
         dt=config.dt,
-        precision=config.precision,
+        fidelity=_fidelity(config, scene, lattice),
         scene_ranges=dict(_range(text) for text in config.ranges),
         symmetry=config.symmetry,
         node_positions=config.node_positions,
@@ -233,6 +243,20 @@ def configuration_of(config: GenerateConfig) -> tuple[Configuration, Floats | No
         trajectory_rate=config.trajectory_rate,
     )
     return configuration, stretches, hops
+
+
+def _fidelity(config: GenerateConfig, scene: Scene, lattice: Lattice) -> Fidelity:
+    """The fidelity of a command with all its levers; an automatic one is chosen here, once, and recorded."""
+    if config.fidelity == "auto":
+        if config.ranges:
+            raise InvalidParameterError("fidelity: expected another than auto with --ranges: it is chosen for one scene")
+        chosen = choose_fidelity(config.design, scene, lattice, config.tolerance)
+    elif config.tolerance is not None:
+        raise InvalidParameterError(f"tolerance: expected only with --fidelity auto, got --fidelity {config.fidelity}")
+    else:
+        chosen = named_fidelity(config.fidelity)
+    usual = "float32" if config.fidelity == "paper" else None
+    return changed(chosen, {"precision": config.precision or usual, "stop": config.stop})
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:

@@ -26,6 +26,7 @@ from surrogate.storage import hash_of
 from tensegrity_gym import MODEL_VERSION, Design, Equilibria, HopResult, HopStatus, Lattice, Scene
 from tensegrity_gym.energies import centre_of_mass
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.fidelity import Fidelity, changed, named_fidelity
 from tensegrity_gym.types import Floats, Ints
 
 
@@ -44,8 +45,10 @@ class Configuration:
     """Of the stretches, where they come from a file."""
     dt: float | None = None
     """Time step [s]; None lets the simulator choose."""
-    precision: str = "float64"
-    """Of the simulator's lanes."""
+    fidelity: Fidelity | str = "paper"
+    """How finely a hop is modelled; a name out of ``tensegrity_gym.fidelity.FIDELITIES`` or a Fidelity."""
+    precision: str | None = None
+    """Of the simulator's lanes; None for the fidelity's."""
     content: str = "hops"
     """hops, or equilibria alone."""
     scene_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -62,6 +65,7 @@ class Configuration:
     """Frames per second [Hz]."""
 
     def __post_init__(self) -> None:
+        _ = self.model  # an unknown fidelity or precision is refused here
         for name, allowed in (("sampler", SAMPLERS), ("content", CONTENTS), ("trajectory", TRAJECTORIES)):
             if getattr(self, name) not in allowed:
                 raise InvalidParameterError(f"{name}: expected one of {allowed}, got {getattr(self, name)!r}")
@@ -86,7 +90,9 @@ class Configuration:
     def as_dict(self) -> dict[str, Any]:
         """JSON-like content, with the versions of schema and physics."""
         plain = {
-            k: getattr(self, k) for k in self.__dataclass_fields__ if k not in ("design", "scene", "lattice", "scene_ranges")
+            k: getattr(self, k)
+            for k in self.__dataclass_fields__
+            if k not in ("design", "scene", "lattice", "scene_ranges", "fidelity", "precision")
         }
         return {
             "schema_version": SCHEMA_VERSION,
@@ -94,9 +100,21 @@ class Configuration:
             "design": asdict(self.design),
             "scene": asdict(self.scene),
             "lattice": asdict(self.lattice),
+            "fidelity": self.model.levers(),
+            "precision": self.model.precision,
             "scene_ranges": {name: [float(b) for b in bounds] for name, bounds in sorted(self.scene_ranges.items())},
             **plain,
         }
+
+    @property
+    def model(self) -> Fidelity:
+        """The fidelity with all its levers."""
+        return changed(named_fidelity(self.fidelity), {"precision": self.precision})
+
+    @property
+    def modelled(self) -> Design:
+        """The design as the fidelity models it: what decides shapes and masses."""
+        return self.model.design(self.design)
 
     @property
     def symmetries(self) -> tuple[Ints, Ints]:
@@ -208,7 +226,7 @@ def from_result(
         track = result.trajectory
         positions = track.positions
         if configuration.trajectory == "centre":
-            positions = centre_of_mass(configuration.design.structure(configuration.lattice), positions)
+            positions = centre_of_mass(result.structure, positions)
             positions[np.arange(positions.shape[1]) >= track.frames[:, None]] = 0.0
         columns |= {"frames": track.frames, "frame_times": track.times, "trajectory": positions}
     columns |= _common(found, configuration, index, cpu_seconds, scene_values or {})

@@ -16,6 +16,8 @@ from surrogate.hops import HopData
 from surrogate.storage import atomic_path, ensure_folder
 from tensegrity_gym import ENERGY_NAMES, Design, HopStatus, Lattice, Scene, form_find, simulate
 from tensegrity_gym.errors import DataFileError
+from tensegrity_gym.events import flew
+from tensegrity_gym.fidelity import Fidelity
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -49,7 +51,7 @@ def findings(data: HopData) -> dict[str, str]:
     for status in HopStatus:
         said[f"status {status.name}"] = str(int((data["status"] == status).sum()))
     colour = figures.alternating(usable["stretches"])
-    for name in ("rest", "touchdown"):
+    for name in figures.places(usable):
         distance = np.hypot(*usable[name].T)
         low, middle, high = np.percentile(distance, (5, 50, 95))
         said[f"{name}: distance"] = f"median {middle:.3f} m, 5 % {low:.3f}, 95 % {high:.3f}, farthest {distance.max():.3f} m"
@@ -78,8 +80,8 @@ def findings(data: HopData) -> dict[str, str]:
         f"stretch, correlation {np.corrcoef(mean, usable['apex'])[0, 1]:+.3f}"
     )
     total = usable["energies"].sum(axis=2)
-    flew = usable["status"] <= HopStatus.TIME_LIMIT
-    drift = 100 * np.abs(total - total[:, :1])[flew].max(axis=1) / usable["stored_energy"][flew]
+    up = flew(usable["status"])
+    drift = 100 * np.abs(total - total[:, :1])[up].max(axis=1) / usable["stored_energy"][up]
     if len(drift):
         said["energy audit"] = f"closes to {np.median(drift):.2g} % of the stored energy (median), {drift.max():.2g} % (worst)"
     kinetic = usable["energies"][:, 3, ENERGY_NAMES.index("kinetic")] / usable["stored_energy"]
@@ -90,18 +92,21 @@ def findings(data: HopData) -> dict[str, str]:
 
 def measured_floor(data: HopData, hops: int) -> dict[str, str]:
     """How far landings move when the start of a hop is moved by 10 um: nothing predicts them better than that."""
+    from surrogate import figures
+
     c = data.configuration
-    settings: dict[str, Any] = {"design": Design(**c["design"]), "scene": Scene(**c["scene"]), "lattice": Lattice(**c["lattice"])}
+    settings: dict[str, Any] = {"scene": Scene(**c["scene"]), "lattice": Lattice(**c["lattice"])}
+    design, fidelity = Design(**c["design"]), Fidelity(**c.get("fidelity", {"precision": c["precision"]}))
     rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
-    start = form_find(data["stretches"][rows], **settings)
+    start = form_find(data["stretches"][rows], design=fidelity.design(design), **settings)
     shift = np.random.default_rng(0).normal(size=start.positions.shape)
     shift *= PERTURBATION / np.linalg.norm(shift, axis=2, keepdims=True)
     shift[:, :, 2] = np.where(start.positions[:, :, 2] + shift[:, :, 2] < 0, 0.0, shift[:, :, 2])
     moved = replace(start, positions=start.positions + shift)
-    how = {"dt": c["dt"], "precision": c["precision"], **settings}
+    how = {"dt": c["dt"], "design": design, "fidelity": fidelity, **settings}
     pair = [simulate(start.stretches, equilibria=e, **how) for e in (start, moved)]
     said = {}
-    for name in ("touchdown", "rest"):
+    for name in reversed(figures.places(data.rows(rows))):
         apart = 1e3 * np.linalg.norm(getattr(pair[0], name) - getattr(pair[1], name), axis=1)
         middle, high = np.percentile(apart, (50, 90))
         said[f"{name}: floor"] = f"{middle:.2f} mm (median), {high:.2f} mm (90 %), of {len(rows)} hops started 10 µm off"

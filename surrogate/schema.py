@@ -5,6 +5,7 @@ Version 1 had no per-hop index, no split share, no checksums per chunk and no ch
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -35,6 +36,10 @@ class Column(NamedTuple):
     measured: bool = False  #: a measurement of the run, which no rerun repeats; left out of the digest
 
 
+def _said(statuses: Iterable[HopStatus]) -> str:
+    return ", ".join(f"{s.value} {s.name}" for s in statuses)
+
+
 #: Columns of every file of hops, in their order.
 COLUMNS: dict[str, Column] = {
     "index": Column((), "i8", "1", "number of the hop in its sampler's sequence; unique but for symmetry images"),
@@ -57,7 +62,7 @@ COLUMNS: dict[str, Column] = {
     "equilibrium_energy": Column((), "f8", "J", "total potential energy of the equilibrium"),
     "residual": Column((), "f8", "N", "largest force left on a mass in the equilibrium"),
     "iterations": Column((), "i8", "1", "iterations of form-finding"),
-    "status": Column((), "i8", "1", ", ".join(f"{s.value} {s.name}" for s in HopStatus)),
+    "status": Column((), "i8", "1", _said(HopStatus)),
     "steps": Column((), "i8", "1", "time steps of the hop"),
     "cpu_seconds": Column((), "f8", "s", "CPU time per hop, mean over its chunk; 0 for symmetry images", measured=True),
 }
@@ -81,6 +86,9 @@ def columns_of(configuration: dict[str, Any]) -> dict[str, Column]:
     """Columns, in order, of a file made with ``configuration`` (see ``Configuration.as_dict``)."""
     content = configuration.get("content", "hops")
     columns = dict(COLUMNS if content == "hops" else EQUILIBRIUM_COLUMNS)
+    if content == "hops" and "fidelity" not in configuration:  # a file from before fidelities, when no hop was stopped
+        known = [s for s in HopStatus if s is not HopStatus.STOPPED]
+        columns["status"] = columns["status"]._replace(description=_said(known))
     for name in sorted(configuration.get("scene_ranges") or {}):
         columns[f"scene_{name}"] = Column((), "f8", SCENE_VALUES[name], f"Scene.{name} of this hop")
     if configuration.get("node_positions"):
@@ -94,7 +102,9 @@ def columns_of(configuration: dict[str, Any]) -> dict[str, Column]:
 
 def expected_shape(column: Column, hops: int, configuration: dict[str, Any], frames: int = 0) -> tuple[int, ...]:
     """Shape of a column's whole data set."""
-    lengths = {FRAMES: frames, **_lengths(**configuration["lattice"], bar_segments=int(configuration["design"]["bar_segments"]))}
+    fidelity = configuration.get("fidelity") or {}  # files from before there were any have the paper's
+    segments = int(fidelity.get("bar_segments") or configuration["design"]["bar_segments"])
+    lengths = {FRAMES: frames, **_lengths(**configuration["lattice"], bar_segments=segments)}
     return (hops, *(lengths.get(k, k) for k in column.shape))
 
 

@@ -45,7 +45,7 @@ def _image(data: HopData, configuration: Configuration, number: int, permutation
 
 def mass_permutation(configuration: Configuration, signs: Ints) -> Ints:
     """For each mass, the one that lies at its mirror image in the unloaded lattice, shape (n_masses,)."""
-    x: Floats = configuration.design.unloaded_positions(configuration.lattice)
+    x: Floats = configuration.modelled.unloaded_positions(configuration.lattice)
     mirrored = x * np.array((*signs, 1.0))
     distance = np.linalg.norm(x[:, None] - mirrored[None], axis=2)
     nearest = distance.argmin(axis=1)
