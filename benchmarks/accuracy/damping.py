@@ -87,7 +87,7 @@ def plot(d: Data) -> Figure:
         axis.loglog(hertz, np.maximum(d["ratios"][:, k], 1e-7), mark, ms=4, alpha=0.6, label=source)
     axis.loglog(hertz, d["ratios"].sum(axis=1), "k-", lw=0.6, label="all")
     axis.axhspan(5e-4, 5e-3, color="0.9", zorder=0)
-    axis.text(hertz.min(), 3e-3, "carbon rods alone", fontsize=8, color="0.4")
+    axis.text(150.0, 2.2e-3, "carbon rods alone", fontsize=8, color="0.4", zorder=0)
     axis.set(xlabel="frequency [Hz]", ylabel="damping ratio [-]", ylim=(1e-5, 2))
     axis.grid(alpha=0.3)
     axis.legend(fontsize=7, loc="upper left")

@@ -131,7 +131,7 @@ def report(d: Data) -> list[str]:
                 f"{d[f'{at}/converged'].sum()}",
                 f"{d[f'{at}/can_fly'].sum()}",
                 f"{(d[f'{at}/status'] <= HopStatus.TIME_LIMIT).sum()}",
-                f"{np.median(d[f'{at}/speed']):.3f}",
+                f"{np.median(d[f'{at}/speed'][d[f'{at}/converged']]):.3f}",
                 f"{d[f'{at}/audit'].max():.1e}",
                 statuses(d[f"{at}/status"]),
             ]
@@ -172,7 +172,7 @@ def report(d: Data) -> list[str]:
 def plot(d: Data) -> Figure:
     """Take-off speed under gravity, step and audit over stiffness, critical step along hops."""
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.3), layout="constrained")
-    speeds = np.array([np.percentile(d[f"gravity/{g:g}/speed"], (5, 50, 95)) for g in GRAVITIES])
+    speeds = np.array([np.percentile(d[f"gravity/{g:g}/speed"][d[f"gravity/{g:g}/converged"]], (5, 50, 95)) for g in GRAVITIES])
     axes[0].semilogx(GRAVITIES, speeds[:, 1], "o-")
     axes[0].fill_between(GRAVITIES, speeds[:, 0], speeds[:, 2], alpha=0.2)
     axes[0].set(xlabel="gravity / g", ylabel="take-off speed, 0 without flight [m/s]")

@@ -186,9 +186,11 @@ def plot(d: Data) -> Figure:
                     best = max(k for k in SEGMENTS if f"segments/{k}/touchdown" in d)
                     moved = np.median(error(d[f"segments/{n}/{name}"], d[f"segments/{best}/{name}"]))
                     axis.axhline(moved, color=colour, ls=":", lw=1, label=f"{n} against {best} segments")
-        axis.set(xlabel="time step [µs]", title=label)
+        ticks = 19.2 / 2.0 ** np.arange(4)
+        axis.set(xlabel="time step [µs]", title=label, xticks=ticks, xticklabels=[f"{t:g}" for t in ticks])
+        axis.minorticks_off()
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=7)
+        axis.legend(fontsize=7, loc="lower right")
     return figure
 
 
