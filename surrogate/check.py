@@ -159,7 +159,8 @@ def _stopped(data: HopData) -> np.ndarray:
 def _times(data: HopData) -> np.ndarray:
     limit = data.configuration["scene"]["duration"] * 1.01 + 2e-3  # whole strides of steps
     a, b, c = data["takeoff_time"], data["touchdown_time"], data["end_time"]
-    order = (a >= 0) & (b >= a) & (c >= b - 1e-9)
+    step = c / np.maximum(data["steps"], 1)  # a hop that ends with its touchdown ends with the step before it
+    order = (a >= 0) & (b >= a) & (c >= b - step)
     moved = (data["status"] == HopStatus.NOT_CONVERGED) | ((data["steps"] > 0) & (c > 0))
     return (order | ~_flew(data)) & (c <= limit) & (c >= 0) & moved
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from surrogate.hops import HopData
-from surrogate.schema import EVENTS
+from surrogate.scenes import unit_of
+from surrogate.schema import EVENTS, SCENE_VALUES
 from surrogate.storage import atomic_path
 from tensegrity_gym import ENERGY_NAMES, STRETCH_RANGE, HopStatus
 from tensegrity_gym.errors import MissingExtraError
@@ -76,7 +77,8 @@ def landing_map(data: HopData) -> Figure:
         dots = axis.scatter(*data[name].T, c=colour, cmap="coolwarm", vmin=-1.2, vmax=1.2, s=size, linewidths=0)
         axis.plot(0, 0, "+", color="black", ms=10)
         side = 1.05 * float(np.abs(data[name]).max() or 1.0)
-        axis.set(xlabel="x [m]", ylabel="y [m]", title=f"{name} of {len(data)} hops", aspect="equal")
+        unit = unit_of(data)
+        axis.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", title=f"{name} of {len(data)} hops", aspect="equal")
         axis.set(xlim=(-side, side), ylim=(-side, side))
     figure.colorbar(dots, ax=axes, label="λ1 − λ2 + λ3 − λ4 [-]")
     return figure
@@ -95,7 +97,7 @@ def reach(data: HopData) -> Figure:
         axis.fill(around, np.append(high, high[0]), color=COLOURS[0], alpha=0.25, label="95 % of hops")
         axis.plot(around, np.append(high, high[0]), color=COLOURS[0], lw=1.5)
         axis.plot(around, np.append(top, top[0]), color=COLOURS[5], lw=1.5, label="farthest hop")
-        axis.set_title(f"{name}: distance [m] by direction")
+        axis.set_title(f"{name}: distance [{unit_of(data)}] by direction")
         axis.set_rlabel_position(22.5)
     axes[0, -1].legend(loc="lower left", bbox_to_anchor=(0.9, 0.9))
     return figure
@@ -107,7 +109,8 @@ def apex(data: HopData) -> Figure:
     size = float(np.clip(4e4 / max(len(data), 1), 3, 26))
     spread = np.ptp(data["stretches"], axis=1)
     dots = axis.scatter(data["stretches"].mean(axis=1), data["apex"], c=spread, s=size, cmap="viridis", linewidths=0)
-    axis.set(xlabel="mean stretch λ [-]", ylabel="apex: rise of the centre of mass [m]")
+    scaled = "" if unit_of(data) == "m" else ", times g over the Earth's"
+    axis.set(xlabel="mean stretch λ [-]", ylabel=f"apex: rise of the centre of mass [m]{scaled}")
     figure.colorbar(dots, ax=axis, label="largest − least λ of the hop [-]")
     return figure
 
@@ -148,6 +151,26 @@ def outcomes(data: HopData) -> Figure:
     return figure
 
 
+def across_scenes(data: HopData) -> Figure:
+    """How far hops land [m] against each value of the scene that varies."""
+    ranges, names = data.configuration["scene_ranges"], places(data)
+    size = (5.5 * len(ranges), 3.8 * len(names))
+    figure, axes = plt.subplots(len(names), len(ranges), figsize=size, layout="constrained", squeeze=False)
+    for row, name in zip(axes, names, strict=True):
+        distance = np.hypot(*data[name].T)
+        for axis, (value, (low, high)) in zip(row, ranges.items(), strict=True):
+            came = data[f"scene_{value}"]
+            axis.scatter(came, distance, s=3, color=COLOURS[0], alpha=0.3, linewidths=0)
+            edges = np.linspace(low, high, 9)
+            number = np.clip(np.digitize(came, edges) - 1, 0, 7)
+            for share, colour in ((50, COLOURS[1]), (95, COLOURS[5])):
+                level = [np.percentile(distance[number == k], share) if (number == k).any() else np.nan for k in range(8)]
+                axis.stairs(level, edges, color=colour, lw=1.5, baseline=None, label=f"{share} % of hops land nearer")
+            axis.set(xlabel=f"{value} [{SCENE_VALUES[value]}]", ylabel=f"{name}: distance [m]", ylim=(0, None))
+    axes[0, 0].legend()
+    return figure
+
+
 #: Pictures of a report, in their order, with what each shows.
 PICTURES: dict[str, tuple[Callable[[HopData], Figure], str]] = {
     "landing_map.png": (
@@ -162,6 +185,11 @@ PICTURES: dict[str, tuple[Callable[[HopData], Figure], str]] = {
         "energy counts from the start.",
     ),
     "outcomes.png": (outcomes, "How hops end, by mean stretch."),
+}
+
+#: Beside them, where scenes vary.
+VARIED: dict[str, tuple[Callable[[HopData], Figure], str]] = {
+    "scenes.png": (across_scenes, "How far hops land from their start against each value of the scene that varies."),
 }
 
 

@@ -13,9 +13,10 @@ import tyro
 
 from surrogate import dataset
 from surrogate.hops import HopData
+from surrogate.scenes import comparable, unit_of
 from surrogate.storage import atomic_path, ensure_folder
 from tensegrity_gym import ENERGY_NAMES, Design, HopStatus, Lattice, Scene, form_find, simulate
-from tensegrity_gym.errors import DataFileError
+from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.events import flew
 from tensegrity_gym.fidelity import Fidelity
 
@@ -47,25 +48,34 @@ def findings(data: HopData) -> dict[str, str]:
     from surrogate import figures
 
     usable = data.rows(data.usable)
-    said = {"hops": f"{len(data)}, {len(data) - len(usable)} failed"}
+    unit = unit_of(data)
+    if unit == "reaches":
+        usable = comparable(usable)
+        varying = ", ".join(f"{k} {a:g} to {b:g}" for k, (a, b) in data.configuration["scene_ranges"].items())
+        usual = f"scenes vary ({varying}): landings from the middle of their reach, in reaches; apex times g over the Earth's"
+    else:
+        usual = "landings in metres from the start"
+    said = {"landings": usual, "hops": f"{len(data)}, {len(data) - len(usable)} failed"}
     for status in HopStatus:
         said[f"status {status.name}"] = str(int((data["status"] == status).sum()))
     colour = figures.alternating(usable["stretches"])
     for name in figures.places(usable):
         distance = np.hypot(*usable[name].T)
         low, middle, high = np.percentile(distance, (5, 50, 95))
-        said[f"{name}: distance"] = f"median {middle:.3f} m, 5 % {low:.3f}, 95 % {high:.3f}, farthest {distance.max():.3f} m"
+        said[f"{name}: distance"] = (
+            f"median {middle:.3f} {unit}, 5 % {low:.3f}, 95 % {high:.3f}, farthest {distance.max():.3f} {unit}"
+        )
         angle, reach, _ = figures.reach_by_direction(usable[name])
         order = np.argsort(reach)[::-1][:4]
         said[f"{name}: farthest directions"] = (
-            ", ".join(f"{np.degrees(angle[k]):.0f}° ({reach[k]:.3f} m)" for k in order)
+            ", ".join(f"{np.degrees(angle[k]):.0f}° ({reach[k]:.3f} {unit})" for k in order)
             + f" by the 95th percentile in sectors of {360 / len(angle):.0f}°; nearest {np.degrees(angle[reach.argmin()]):.0f}° "
-            f"({reach.min():.3f} m)"
+            f"({reach.min():.3f} {unit})"
         )
         axes = reach[:: len(angle) // 4].mean()
         diagonals = reach[len(angle) // 8 :: len(angle) // 4].mean()
         said[f"{name}: axes against diagonals"] = (
-            f"{axes:.3f} m at 0/90/180/270°, which the paper finds farthest, {diagonals:.3f} m at 45/135/225/315°"
+            f"{axes:.3f} {unit} at 0/90/180/270°, which the paper finds farthest, {diagonals:.3f} {unit} at 45/135/225/315°"
         )
         along = [np.corrcoef(colour, usable[name][:, k])[0, 1] for k in (0, 1)]
         quadrant = np.corrcoef(colour, np.sign(np.prod(usable[name], axis=1)))[0, 1]
@@ -118,23 +128,24 @@ def report(path: Path, out: Path | None = None, floor: int = 0) -> Path:
     from surrogate import figures
 
     data = dataset.read(path)
-    if data.configuration["scene_ranges"]:
-        raise DataFileError(
-            f"{path}: expected hops of one scene to report on, got scenes that vary; report on shards of one scene"
-        )
+    varied = bool(data.configuration["scene_ranges"])
+    if varied and floor:
+        raise InvalidParameterError(f"floor: expected a file of one scene to measure it in, got scenes that vary in {path}")
     if not data.usable.any():
         raise DataFileError(f"{path}: expected at least one usable hop, got none of {len(data)}")
     folder = ensure_folder(out or path.with_suffix(".report"))
     usable = data.rows(data.usable)
-    for name, (draw, _) in figures.PICTURES.items():
-        figures.save(draw, data if name == "outcomes.png" else usable, folder / name)
+    shown = comparable(usable) if varied else usable
+    pictures = figures.PICTURES | (figures.VARIED if varied else {})
+    for name, (draw, _) in pictures.items():
+        figures.save(draw, {"outcomes.png": data, "scenes.png": usable}.get(name, shown), folder / name)
     said = findings(data) | (measured_floor(data, floor) if floor else {"floor": "not measured; --floor 32 does"})
     about = {k: str(v) for k, v in dataset.attributes(path).items() if k not in ("design", "scene")}
     body = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(path.name)}</title><style>{STYLE}</style>',
         f"<h1>{len(data)} hops</h1>",
         _table(said),
-        *(_figure(folder / name, caption) for name, (_, caption) in figures.PICTURES.items()),
+        *(_figure(folder / name, caption) for name, (_, caption) in pictures.items()),
         "<h2>What was run</h2>",
         _table(about),
         "</html>",

@@ -22,7 +22,8 @@ from surrogate.export import ExportConfig
 from surrogate.export import main as export
 from surrogate.merge import merge
 from surrogate.report import findings, report
-from tensegrity_gym import Scene
+from surrogate.scenes import comparable
+from tensegrity_gym import Scene, task
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 
 CONFIGURATION = Configuration(scene=Scene(duration=1.2), precision="float32")
@@ -143,6 +144,25 @@ def test_report_is_one_page_with_its_pictures(hops: Path, tmp_path: Path) -> Non
     assert "touchdown: floor" in text
     said = findings(dataset.read(hops))
     assert "0/90/180/270°" in said["rest: axes against diagonals"]
+
+
+def test_report_compares_hops_of_scenes_that_vary(tmp_path: Path) -> None:
+    ranges = {"gravity": (3.0, 9.8), "slope": (0.0, 0.1)}
+    configuration = Configuration(scene=Scene(duration=1.3, landing="touchdown"), scene_ranges=ranges, hops_per_scene=8)
+    path = tmp_path / "hops.h5"
+    generate.fill(path, 24, configuration, progress=False)
+    text = report(path, tmp_path / "report").read_text(encoding="utf-8")
+    assert text.count("data:image/png;base64,") == 6
+    assert "gravity 3 to 9.8, slope 0 to 0.1" in text
+    data = dataset.read(path)
+    shown = comparable(data)
+    for k in (0, 10, 20):
+        scene = Scene(gravity=data["scene_gravity"][k], slope=data["scene_slope"][k], landing="touchdown")
+        away = data["touchdown"][k] - task.reachable_middle(scene)
+        np.testing.assert_allclose(shown["touchdown"][k], away / task.reach(scene), rtol=1e-12)
+        assert shown["apex"][k] == pytest.approx(data["apex"][k] * scene.gravity / 9.80665, rel=1e-12)
+    with pytest.raises(InvalidParameterError, match="floor: expected a file of one scene"):
+        report(path, tmp_path / "again", floor=2)
 
 
 def test_reach_by_direction_finds_the_far_direction() -> None:
