@@ -13,6 +13,7 @@ import naive
 import numpy as np
 import pytest
 
+import tensegrity_gym
 from benchmarks.accuracy.drops import drop
 from tensegrity_gym import Design, Equilibria, HopStatus, InvalidParameterError, Lattice, Scene, form_find, simulate
 from tensegrity_gym.timestep import critical_time_step
@@ -203,6 +204,19 @@ def test_a_dropped_cell_buckles_and_springs_back_with_its_energy_accounted_for(s
     assert fold[0] < np.degrees(found["fold"]) < fold[1]
     assert found["critical"] > 0.98
     assert np.isnan(drop(speed, 1.05, 0.06, CELL)["audit"])
+
+
+@pytest.mark.parametrize("speed", [1.0, 30.0])
+def test_what_the_user_sees_of_a_drop(speed: float) -> None:
+    """A landing with its energy accounted for below the critical step, a refusal with both numbers above it."""
+    critical = critical_time_step(DESIGN.structure(CELL), DESIGN.unloaded_positions(CELL))
+    scene = Scene(duration=0.1)
+    r = tensegrity_gym.drop([0.0, 0.0, -speed], lattice=CELL, scene=scene, threads=1)
+    assert r.status.tolist() == [HopStatus.TIME_LIMIT]
+    total = r.energies.sum(axis=2)[0]
+    assert np.abs(total - total[0]).max() < 1e-3 * r.energies[0, 0, 3]
+    with pytest.raises(InvalidParameterError, match="above the critical step"):
+        tensegrity_gym.drop([0.0, 0.0, -speed], lattice=CELL, scene=scene, dt=1.05 * critical, threads=1)
 
 
 # --- degenerate geometry -----------------------------------------------------------------------------------------------

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import tyro
 
-from benchmarks.accuracy import bars, damping, drops, floor, growth, limits, reference, rounding, sensitivity, stability
+from benchmarks.accuracy import bars, damping, drops, floor, growth, limits, reference, rounding, scenes, sensitivity, stability
 from benchmarks.accuracy.part import Options
 
-MODULES = (bars, reference, floor, sensitivity, growth, stability, limits, drops, rounding, damping)
+MODULES = (bars, reference, floor, sensitivity, growth, stability, limits, drops, rounding, damping, scenes)
 PARTS = {module.PART.name: module.PART for module in MODULES}
 
 

@@ -50,18 +50,18 @@ def launch(r: HopResult | WitnessedHop) -> Floats:
     return r.takeoff_velocity - time[..., None] * AIRBORNE.gravity_vector
 
 
-def witness(options: Options, hop: int) -> Data:
-    """What DOP853 between events makes of one hop of the sample."""
+def witness(options: Options, hop: int, tightness: float = 1.0) -> Data:
+    """What DOP853 between events makes of one hop of the sample, its tolerances divided by ``tightness``."""
 
     def follow() -> Data:
         design, lattice = Design(), Lattice()
         found = form_find(stretches(16)[hop : hop + 1], scene=AIRBORNE, threads=1)
         flight_speed = np.sqrt(2 * AIRBORNE.gravity * 1e-3 * design.cell_height)  # as simulate: a rise of 1e-3 l
-        event_hop = EventHop(design.structure(lattice), AIRBORNE.ground, found.positions[0])
+        event_hop = EventHop(design.structure(lattice), AIRBORNE.ground, found.positions[0], tightness)
         r = event_hop.run(AIRBORNE.duration, flight_speed)
         return {k: np.array(v) for k, v in vars(r).items() if k != "positions"} | {"launch": launch(r)}
 
-    return kept(options, "witness", follow, hop=hop)
+    return kept(options, "witness", follow, hop=hop, **({} if tightness == 1.0 else {"tightness": tightness}))
 
 
 def measure(options: Options) -> Data:
@@ -81,6 +81,8 @@ def measure(options: Options) -> Data:
     for hop in range(options.size(WITNESSED, 0)):
         for name, values in witness(options, hop).items():
             data[f"witness/{hop}/{name}"] = values
+    if not options.quick:
+        data |= {f"tight/{name}": values for name, values in witness(options, 0, tightness=10.0).items()}
     return data
 
 
@@ -158,7 +160,11 @@ def _witness_lines(d: Data) -> list[str]:
                 row.append(f"{unit * distance:.{digits}f}")
             rows.append([*row, str(int(d[f"witness/{hop}/events"]))])
     head = "hop  step  take-off [us]  launch [mm/s]  touchdown [us]  touchdown [mm]  contact events"
-    return ["", "against DOP853 between contact events", *table(head, rows)] if rows else []
+    if not rows:
+        return []
+    own = [error(d[f"tight/{name}"], d[f"witness/0/{name}"]) for name in ("launch", "touchdown")]
+    lines = [f"DOP853 with tenfold tolerances from itself, hop 0: {1e3 * own[0]:.2g} mm/s, {1e3 * own[1]:.2g} mm at touchdown"]
+    return ["", "against DOP853 between contact events", *table(head, rows), *lines]
 
 
 def plot(d: Data) -> Figure:
