@@ -284,8 +284,14 @@ def cg_search(problem: Problem, options: SearchOptions, threads: int | None, pro
     return Found(*records, settings.tolerance, settings.max_iterations)
 
 
-def relaxation_search(problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None) -> Found:
-    """Dynamic relaxation from the unloaded lattice, one lattice after another in each thread."""
+def relaxation_search(
+    problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None, mass: Floats | None = None
+) -> Found:
+    """Dynamic relaxation from the unloaded lattice, one lattice after another in each thread.
+
+    ``mass`` (n, n_masses) [N step^2/m] replaces the :func:`fictitious_masses`; real ones over the square of a time step relax as
+    a simulation does.
+    """
     structure, design = problem.structure, problem.design
     settings = RelaxationSettings(
         tolerance=(options.tolerance or 2e-6) * design.critical_load,
@@ -295,7 +301,7 @@ def relaxation_search(problem: Problem, options: SearchOptions, threads: int | N
         longest_step=0.05 * design.cell_height,
     )
     ground, dead_load, gravity = _ground(problem), imperfection_forces(design, structure), problem.normal_gravity
-    mass = fictitious_masses(structure, problem.stretches, ground.soft_ground)
+    mass = fictitious_masses(structure, problem.stretches, ground.soft_ground) if mass is None else mass
     records = _descent_records(problem)
 
     def work(first: int, last: int, counter: np.ndarray) -> None:

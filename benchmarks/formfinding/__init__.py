@@ -1,0 +1,1 @@
+"""Form-finding measured, one module for each question; see ``__main__``."""
