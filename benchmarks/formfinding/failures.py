@@ -13,6 +13,8 @@ from tensegrity_gym.searches import SearchOptions
 
 def failures(config: Config) -> None:
     """Maps of found, another found, none found on the 2x2 lattice: over stretch and prestrain, over stretch and bar."""
+    weight(config)
+    extremes()
     levels = np.array((0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 0.9, 1.0, 1.1, 1.3))
     fewer = levels[[0, 2, 4, 6, 8, 10, 12]]
     strained = [(f"{p:g}", Design(prestrain=p)) for p in (0.0, 1e-4, 5e-4, 2e-3, 5e-3)]
@@ -33,8 +35,6 @@ def failures(config: Config) -> None:
         for (name, _), row in zip(designs, image, strict=True):
             print(f"{what} {name:>7s}  {' '.join(str(int(v)) for v in row)}", flush=True)
     save(figure, config, "failures")
-    weight(config)
-    extremes()
 
 
 def weight(config: Config) -> None:
@@ -73,7 +73,7 @@ def outcome(method: str, design: Design, levels: np.ndarray) -> np.ndarray:
     batch = np.repeat(levels[:, None], LATTICE.n_cells, axis=1)
     batch[:, 1::2] = 0.5
     reference = form_find(batch, design=design, outside=True, options=SearchOptions(load_step=0.03))
-    options = SearchOptions(max_iterations={"cg": 40_000, "relaxation": 300_000}.get(method))
+    options = SearchOptions(max_iterations=300_000 if method == "relaxation" else None)
     found = form_find(batch, design=design, outside=True, method=method, options=options)
     same = np.abs(found.energy - reference.energy) < (SAME if method == "newton" else 1e-5)
     return np.where(found.converged, np.where(same & reference.converged, 2, 1), 0)
