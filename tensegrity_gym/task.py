@@ -40,6 +40,9 @@ LEVERS = ("dt", *(f.name for f in fields(Fidelity) if f.name != "reason"))
 #: Names of fidelities: those of ``simulate``, and the paper's in single precision.
 FIDELITY_NAMES = (*NAMES, "single")
 
+#: How far a rounded action may lie out of its range [-]: four units in the last place of float32 there.
+ROUNDING = 4 * float(np.spacing(np.float32(STRETCH_RANGE[1])))
+
 _FAILED = (int(HopStatus.UNSTABLE), int(HopStatus.NOT_CONVERGED))
 
 
@@ -233,7 +236,8 @@ def check_target(target: ArrayLike, scene: Scene) -> Floats:
 def check_action(action: Any, shape: tuple[int, ...]) -> Floats:
     """Stretches as float64 within ``STRETCH_RANGE``; InvalidStretchesError where an action is no such thing.
 
-    float32 cannot hold 0.2 and 0.8 exactly, so bounds are checked as float32 and the overshoot is cut off.
+    float32 cannot hold 0.2 and 0.8 exactly, and whoever rescales actions to them, as gymnasium's RescaleAction does, rounds
+    once more: an overshoot of up to ``ROUNDING`` is cut off.
     """
     low, high = STRETCH_RANGE
     try:
@@ -245,8 +249,7 @@ def check_action(action: Any, shape: tuple[int, ...]) -> Floats:
     stretches = given.astype(np.float64)
     if stretches.shape != shape:
         raise InvalidStretchesError(f"action: expected shape {shape}, got {stretches.shape}")
-    single = stretches.astype(np.float32)
-    bad = ~((single >= np.float32(low)) & (single <= np.float32(high)))  # NaN fails this too
+    bad = ~((stretches >= low - ROUNDING) & (stretches <= high + ROUNDING))  # NaN fails this too
     if bad.any():
         worst = stretches[np.argmax(bad.any(axis=-1))] if stretches.ndim > 1 else stretches
         raise InvalidStretchesError(

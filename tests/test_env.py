@@ -449,6 +449,40 @@ def test_the_bounds_themselves_are_actions_in_either_precision() -> None:
             simulate(checked, scene=Scene(duration=0.01))  # and the simulator takes them
 
 
+@pytest.mark.parametrize("bound", [-1.0, 1.0])
+def test_rescaled_actions_reach_the_ends_of_the_range(bound: float) -> None:
+    """gymnasium's own wrapper rounds 0.8 to 0.80000007."""
+    env = gym.wrappers.RescaleAction(gym.make("TensegrityHop-v0", scene=SHORT), np.float32(-1), np.float32(1))
+    env.reset(seed=0)
+    _, reward, *_ = env.step(np.full(4, bound, dtype=np.float32))
+    plain = gym.make("TensegrityHop-v0", scene=SHORT)
+    plain.reset(seed=0)
+    assert plain.step(np.full(4, 0.2 if bound < 0 else 0.8))[1] == pytest.approx(reward, rel=1e-6)
+    over = np.full(4, 0.8 + 2 * task.ROUNDING)
+    with pytest.raises(InvalidStretchesError, match=r"expected finite stretches in \[0.2, 0.8\]"):
+        task.check_action(over, (4,))
+
+
+def test_gymnasium_check_env_renders_every_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a window that needs no display."""
+    monkeypatch.setattr(viewer, "Window", NoWindow)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*symmetric and normalized.*")
+        check_env(gym.make("TensegrityHop-v0", scene=SHORT, render_mode="rgb_array").unwrapped)
+
+
+class NoWindow:
+    def __init__(self, width: int, height: int) -> None:
+        pass
+
+    def play(self, pictures: list[np.ndarray], fps: float) -> None:
+        assert pictures
+
+    def close(self) -> None:
+        pass
+
+
 def test_step_needs_a_running_episode() -> None:
     env = TensegrityHopEnv(scene=SHORT)
     with pytest.raises(ResetNeededError, match="call reset"):
