@@ -64,10 +64,10 @@ def drop(speed: float, share: float, duration: float = DURATION, lattice: Lattic
 def measure(options: Options) -> Data:
     """All speeds with all steps."""
     lattice = Lattice(1, 1) if options.quick else Lattice()
-    data: Data = {}
+    duration, data = 0.06 if options.quick else DURATION, {}
     for speed in SPEEDS:
         for share in SHARES:
-            data |= {f"{speed:g}/{share:g}/{k}": np.array(v) for k, v in drop(speed, share, lattice=lattice).items()}
+            data |= {f"{speed:g}/{share:g}/{k}": np.array(v) for k, v in drop(speed, share, duration, lattice).items()}
     return data
 
 

@@ -40,7 +40,7 @@ def spread(base: Floats, moved: list[Floats]) -> Floats:
 
 def measure(options: Options) -> Data:
     """Floors of every hop of the sample and of every kind."""
-    n, small = options.size(256, 32), options.size(32, 8)
+    n, small = options.size(256, 16), options.size(32, 8)
     base = hops(options, n, "none", 0)
     data: Data = {"stretches": stretches(n), **{f"base/{k}": v for k, v in base.items()}}
     for kind, most in zip(KINDS, (4, 2, 2), strict=True):

@@ -18,7 +18,7 @@ FIELDS = ("takeoff_velocity", "takeoff_time", "apex", "touchdown_time", "touchdo
 def measure(options: Options) -> Data:
     """The same hops in both precisions, and the floor in float64, up to touchdown."""
     n, data = options.size(16, 8), {}
-    for name in SCENES:
+    for name in ("earth", "moon") if options.quick else SCENES:
         scene = Scene.preset(name, landing="touchdown")
         scene = Scene.preset(name, duration=scene.duration * (0.55 if name == "earth" else 0.8))  # as long as first flights
         for precision, kind in (("float64", "none"), ("float32", "none"), ("float64", "positions")):
@@ -42,7 +42,7 @@ def apart(d: Data, name: str, other: str, field: str) -> Floats:
 def report(d: Data) -> list[str]:
     """Rounding beside the floor."""
     rows = []
-    for name in SCENES:
+    for name in (n for n in SCENES if f"{n}/float32/none/apex" in d):
         cells = [name, f"{np.median(d[f'{name}/float64/none/flight_time']):.1f}", f"{d[f'{name}/float64/none/apex'].max():.1f}"]
         for field in ("touchdown", "apex", "touchdown_time"):
             for other in ("float32/none", "float64/positions"):
@@ -57,7 +57,7 @@ def report(d: Data) -> list[str]:
 def plot(d: Data) -> Figure:
     """Rounding against the floor, hop by hop."""
     figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained", sharex=True, sharey=True)
-    for axis, name in zip(axes, SCENES, strict=True):
+    for axis, name in zip(axes, [n for n in SCENES if f"{n}/float32/none/apex" in d], strict=False):
         axis.loglog(apart(d, name, "float64/positions", "touchdown"), apart(d, name, "float32/none", "touchdown"), "o", ms=4)
         axis.plot([1e-6, 1e-2], [1e-6, 1e-2], color="k", lw=0.6)
         axis.set(title=name, xlabel="moved by 10 µm at the start [m]")

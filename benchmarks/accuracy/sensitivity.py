@@ -26,10 +26,21 @@ def default(lever: str) -> float:
     return float(getattr(Design() if lever in Design.__dataclass_fields__ else Scene(), lever))
 
 
+def settings(quick: bool) -> list[tuple[str, float]]:
+    """Every lever with every value; in a quick run only with the ends and the default."""
+    few = {lever: sorted({values[0], default(lever), values[-1]}) for lever, values in LEVERS.items()}
+    return [(lever, value) for lever, values in (few if quick else LEVERS).items() for value in values]
+
+
+def measured(d: Data, lever: str) -> list[float]:
+    """The values of a lever that there are data of."""
+    return [value for value in LEVERS[lever] if f"{lever}/{value:g}/status" in d]
+
+
 def measure(options: Options) -> Data:
     """Floors (positions, 10 micrometres) of a sample of hops for every value of every lever."""
     n, seeds, data = options.size(48, 16), options.size(2, 1), {}
-    cases = {f"{lever}/{value:g}": {lever: value} for lever, values in LEVERS.items() for value in values} | {"bare/0": BARE}
+    cases = {f"{lever}/{value:g}": {lever: value} for lever, value in settings(options.quick)} | {"bare/0": BARE}
     for case, values in cases.items():
         changes = {lever: value for lever, value in values.items() if value != default(lever)}
         base = hops(options, n, "none", 0, **changes)
@@ -45,7 +56,8 @@ def measure(options: Options) -> Data:
 def report(d: Data) -> list[str]:
     """Floors and what else the lever changes."""
     rows = []
-    for lever, value in [(lever, value) for lever, values in LEVERS.items() for value in values] + [("bare", 0.0)]:
+    pairs = [(lever, value) for lever in LEVERS for value in measured(d, lever)]
+    for lever, value in [*pairs, ("bare", 0.0)]:
         at = f"{lever}/{value:g}"
         flew = d[f"{at}/status"] <= HopStatus.TIME_LIMIT
         marked = lever != "bare" and value == default(lever)
@@ -63,7 +75,8 @@ def report(d: Data) -> list[str]:
 def plot(d: Data) -> Figure:
     """Medians and 95 % of the floors, one panel for each lever."""
     figure, axes = plt.subplots(1, 4, figsize=(12, 3.3), layout="constrained", sharey=True)
-    for axis, (lever, values) in zip(axes, LEVERS.items(), strict=True):
+    for axis, lever in zip(axes, LEVERS, strict=True):
+        values = measured(d, lever)
         place = np.arange(len(values))
         for name, colour in (("touchdown", "C0"), ("rest", "C3")):
             flew = [d[f"{lever}/{v:g}/status"] <= HopStatus.TIME_LIMIT for v in values]
