@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surrogate import dataset, generate
-from surrogate.check import CheckConfig, check, main, violations
+from surrogate.check import CheckConfig, check, main
 from surrogate.dataset import Configuration, HopData
+from surrogate.rules import violations
 from tensegrity_gym import HopStatus, Scene
 from tensegrity_gym.errors import DataFileError
 
