@@ -38,6 +38,7 @@ class Hops:
         """Landings of the hops and of each ``times`` over from a moved start, shape (n, 1 + times, 2) [m]."""
         nominal = self.simulate(stretches)
         n, found = len(stretches), nominal.equilibria
+        assert found is not None, "hops start from equilibria"
         moved = repeated(found, times)
         noise = np.random.default_rng(SEED).normal(0, PERTURBATION, (times, *found.positions.shape[1:]))
         above = moved.positions[:, :, 2:] > 1e-3
