@@ -146,10 +146,9 @@ def beta_nll(net: HopNet, rows: Rows, beta: float) -> Tensor:
     Seitzer et al. 2022, eq. 5; e and v in units of each output's spread.
     """
     mean, log_variance = net.heads(rows.stretches, rows.scene)
-    wanted = rows.targets
+    wanted = (rows.targets - net.output_mean) / net.output_scale
     known = torch.isfinite(wanted)
-    # in ballistic nets the touchdown's error is that of the sum, so errors are taken in SI units and scaled back
-    error = torch.where(known, (net.undo(mean) - torch.nan_to_num(wanted)) / net.output_scale, 0.0)
+    error = torch.where(known, mean - torch.nan_to_num(wanted), 0.0)
     weight = torch.exp(beta * log_variance.detach())
     loss = torch.where(known, weight * (error**2 * torch.exp(-log_variance) + log_variance), 0.0)
     return loss.sum() / (2 * known.sum().clamp(min=1) * net.config.members)

@@ -32,8 +32,8 @@ class EvaluateConfig:
     """Folder for evaluation.json and pictures; None: print only."""
     floor: int = 0
     """Simulate so many of the hops again from starts 10 um off, and give errors in multiples of how far that moves them."""
-    studies: tuple[Literal["sizes", "nets", "symmetry", "ballistic"], ...] = ()
-    """Train other nets on the same file, into --out: error against data size, widths and depths, ablations; resumable."""
+    studies: tuple[Literal["sizes", "nets", "symmetry"], ...] = ()
+    """Train other nets on the same file, into --out: error against data size, widths and depths, the symmetry; resumable."""
     study_steps: int = 3000
     """Gradient steps of each of the studies' trainings (of one member each)."""
 

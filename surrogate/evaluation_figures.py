@@ -119,6 +119,8 @@ def data_size(cells: dict[str, Any], found: Evaluation) -> Figure:
         if found.floor:
             least = float(np.hypot(found.floor[FLOOR][OUTPUTS[x].name], found.floor[FLOOR][OUTPUTS[y].name]))
             axis.axhline(1e3 * least, color=COLOURS[k], lw=1, ls="--", label=f"{name}'s floor (rms)")
+    axis.set_xticks(hops, [f"{n}" for n in hops], rotation=45)
+    axis.minorticks_off()
     axis.set(xlabel="hops trained on", ylabel="rms error of test hops [mm]")
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure

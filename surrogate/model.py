@@ -19,7 +19,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
-from surrogate.outputs import FLIGHT, LANDING, OUTPUTS, TAKEOFF, TOUCHDOWN, Output, scene_columns, target_columns
+from surrogate.outputs import LANDING, OUTPUTS, Output, scene_columns, target_columns
 from surrogate.schema import SCENE_VALUES
 from surrogate.storage import atomic_path, ensure_folder, read_json, write_json
 from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE, Lattice, Scene
@@ -45,8 +45,6 @@ class NetConfig:
     """Nets in the ensemble; their mean is the prediction, their spread a part of the doubt."""
     symmetric: bool = True
     """Layers that commute with the symmetries of lattice and scene, which makes the net exactly equivariant."""
-    ballistic: bool = False
-    """Predict touchdown as take-off velocity times flight time and a learnt rest, instead of directly."""
 
 
 def scene_symmetries(lattice: Lattice, scene: Scene, varied: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
@@ -163,9 +161,6 @@ class HopNet(nn.Module):
 
     def fit_normalisers(self, targets: Tensor) -> None:
         """Set the output buffers from training targets, shape (n, 9): group-averaged means, so odd outputs get zero."""
-        targets = targets.clone()
-        if self.config.ballistic:
-            targets[:, TOUCHDOWN] -= targets[:, TAKEOFF] * targets[:, FLIGHT]
         mean = torch.nan_to_num(torch.nanmean(targets, dim=0))
         self.output_mean.copy_((self.signs * mean).mean(dim=0))
         spread = torch.sqrt(torch.nanmean((targets - self.output_mean) ** 2, dim=0))
@@ -230,18 +225,10 @@ class HopNet(nn.Module):
         """
         mean, log_variance = self.heads(stretches, scene)
         variance = self.variance_factor * self.output_scale**2 * torch.exp(log_variance)
-        return self.undo(mean), variance
-
-    def undo(self, normalised: Tensor) -> Tensor:
-        """Means in SI units from normalised ones."""
-        mean = self.output_mean + self.output_scale * normalised
-        if not self.config.ballistic:
-            return mean
-        flown = mean[..., TAKEOFF] * mean[..., FLIGHT]
-        return torch.cat([mean[..., LANDING], mean[..., TOUCHDOWN] + flown, mean[..., 4:]], dim=-1)
+        return self.output_mean + self.output_scale * mean, variance
 
     def forward(self, stretches: Tensor, scene: Tensor | None = None) -> Tensor:
-        return self.undo(self.heads(stretches, scene)[0])
+        return self.output_mean + self.output_scale * self.heads(stretches, scene)[0]
 
     def landing(self, stretches: Tensor, scene: Tensor | None = None) -> Tensor:
         """Landing as each member sees it [m], shape (members, ..., n, 2)."""

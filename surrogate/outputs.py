@@ -30,7 +30,7 @@ OUTPUTS: tuple[Output, ...] = (
     Output("takeoff_velocity_z", "takeoff_velocity", 2, "m/s", None),
     Output("flight_time", "flight_time", None, "s", None),
 )
-LANDING, TOUCHDOWN, TAKEOFF, FLIGHT = slice(0, 2), slice(2, 4), slice(5, 7), slice(8, 9)
+LANDING = slice(0, 2)
 
 
 def target_columns(data: HopData) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Trainings of other nets on the same hops: error against data size and net size, and what symmetry and baseline are worth.
+"""Trainings of other nets on the same hops: error against data size and net size, and what the symmetry is worth.
 
 Every training is of one member with the same settings but for what is studied, and is kept as one JSON file, so that a study
 killed is a study continued. Test hops are never trained on: they are those of the whole file's split.
@@ -23,7 +23,7 @@ from surrogate.train import TrainConfig, plain, train
 #: Shares of the hops, for the error against data size.
 SHARES = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 #: Widths and depths of the chart of speed against accuracy.
-WIDTHS, DEPTHS = (32, 64, 128, 256), (2, 3, 4)
+WIDTHS, DEPTHS = (32, 64, 128, 256), (2, 4)
 
 Cell = tuple[str, TrainConfig, int]  #: name, settings, hops to train on
 
@@ -37,8 +37,6 @@ def cells_of(study: str, data: HopData, steps: int) -> list[Cell]:
         return [(f"{round(s * hops)}", base, round(s * hops)) for s in SHARES]
     if study == "nets":
         nets = {f"{d} x {w}": replace(base.net, hidden=(w,) * d) for w in WIDTHS for d in DEPTHS}
-    if study == "ballistic":
-        nets = {"direct": base.net, "ballistic": replace(base.net, ballistic=True)}
     if study == "symmetry":
         free = replace(base, net=replace(base.net, symmetric=False))
         return [("built in", base, hops), ("none", free, hops), ("images as data", replace(free, images=True), hops)]

@@ -98,7 +98,7 @@ def train(
     fingerprint = hash_of({"data": data.digest, "train": plain(config), "outputs": [o.name for o in OUTPUTS]})
     descent = Descent(net, rows, split["train"], split[stop_on], config)
     before = descent.resume(state, fingerprint)
-    _descend(descent, config, progress, desc, state, fingerprint, _logger(log))
+    _descend(descent, config, progress, desc, state, fingerprint, _logger(log, descent.epoch))
     held_back = data.rows(data.split(config.validation, config.test)[stop_on])
     calibrate(net, held_back)
     card = {
@@ -187,8 +187,8 @@ def _descend(
     descent.finish()
 
 
-def _logger(folder: Path | None) -> Callable[[int, dict[str, float]], None]:
-    """A function that writes numbers of an epoch for TensorBoard, or does nothing."""
+def _logger(folder: Path | None, done: int) -> Callable[[int, dict[str, float]], None]:
+    """A function that writes numbers of an epoch for TensorBoard, or does nothing; ``done`` epochs are already written."""
     if folder is None:
         return lambda epoch, values: None
     try:
@@ -197,7 +197,7 @@ def _logger(folder: Path | None) -> Callable[[int, dict[str, float]], None]:
         raise MissingExtraError(
             "log: expected tensorboard to be installed, it is not; pip install 'tensegrity-gym[learn]'"
         ) from missing
-    writer = SummaryWriter(str(folder))
+    writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
 
     def write(epoch: int, values: dict[str, float]) -> None:
         for name, value in values.items():

@@ -13,9 +13,9 @@ from surrogate import dataset, evaluate, model, studies
 from surrogate.dataset import Configuration, HopData
 from surrogate.evaluate import EvaluateConfig
 from surrogate.floor import measure_floor
-from surrogate.model import OUTPUTS, NetConfig, Prediction
+from surrogate.model import OUTPUTS, Prediction
 from surrogate.scores import LEVELS, coverage, disagreement, nearest_hop_noise, of_data, ranking, rmse, speed
-from surrogate.train import TrainConfig, train
+from surrogate.train import train
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tests.test_surrogate_model import LATTICE, QUICK, closed_form_data
@@ -70,7 +70,7 @@ def test_coverage_and_ranking_of_a_prediction_that_is_right() -> None:
     assert abs(blind["touchdown"]["deviation"]) < 0.05
 
 
-def test_a_member_is_the_ensemble_s_and_the_slow_part_of_its_speed() -> None:
+def test_members_are_the_ensemble() -> None:
     net, _ = train(closed_form_data(30), replace(QUICK, epochs=2), progress=False)
     data = closed_form_data(10, seed=4)
     members = [net.member(k) for k in range(net.config.members)]
@@ -79,7 +79,7 @@ def test_a_member_is_the_ensemble_s_and_the_slow_part_of_its_speed() -> None:
     apart = np.std([of_data(one, data).mean for one in members], axis=0)
     np.testing.assert_allclose(disagreement(net, data), apart * np.sqrt(net.variance_factor.numpy()), atol=1e-6)
     found = speed(net, batch=64, seconds=0.05)
-    assert found["predictions_per_second_member"] > found["predictions_per_second_ensemble"] > 0
+    assert min(found.values()) > 0
 
 
 def test_command_writes_numbers_and_pictures_and_goes_on_with_its_studies(
@@ -93,7 +93,7 @@ def test_command_writes_numbers_and_pictures_and_goes_on_with_its_studies(
     net, card = train(data, replace(QUICK, epochs=30), progress=False)
     checkpoint = model.save(net, tmp_path / "net.safetensors", card)
     out = tmp_path / "out"
-    config = EvaluateConfig(checkpoint, path, out=out, studies=("sizes", "nets", "symmetry", "ballistic"), study_steps=3)
+    config = EvaluateConfig(checkpoint, path, out=out, studies=("sizes", "nets", "symmetry"), study_steps=3)
     evaluate.main(config)
     assert "Spearman" in capsys.readouterr().out
     found = json.loads((out / "evaluation.json").read_text())
@@ -138,13 +138,3 @@ def test_floor_of_simulated_hops_is_small_and_grows_with_the_step() -> None:
     varied = HopData(data.columns, Configuration(scene_ranges={"gravity": (1.0, 9.0)}).as_dict())
     with pytest.raises(InvalidParameterError, match="gravity"):
         measure_floor(varied, 2)
-
-
-def test_ballistic_net_learns_what_flight_does_not_explain() -> None:
-    data = closed_form_data(200)
-    flown = data["takeoff_velocity"][:, :2] * data["flight_time"][:, None]
-    data = HopData(data.columns | {"touchdown": flown + 0.01 * data["landing"]}, data.configuration)
-    config = TrainConfig(net=NetConfig(hidden=(32,), members=2, ballistic=True), epochs=400)
-    net, card = train(data, config, progress=False)
-    assert float(net.output_scale[2]) < 0.2 * float(np.std(data["touchdown"][:, 0]))  # of the rest alone
-    assert card["rmse"]["test"]["touchdown_x"] < 0.15 * float(np.std(data["touchdown"][:, 0]))

@@ -157,7 +157,7 @@ def test_checkpoint_round_trip_and_refusals(tmp_path: Path) -> None:
         model.load(tmp_path / "absent.safetensors")
 
 
-@pytest.mark.parametrize("config", [NetConfig(hidden=(32, 16)), NetConfig(hidden=(16, 16, 16), ballistic=True)])
+@pytest.mark.parametrize("config", [NetConfig(hidden=(32, 16)), NetConfig(hidden=(16, 16, 16))])
 def test_net_is_equivariant_with_scenes_as_inputs_the_slope_turning_along(config: NetConfig) -> None:
     ranges = {"gravity": (1.6, 9.81), "friction": (0.3, 0.8), "slope": (0.0, 0.3), "slope_direction": (0.0, 6.0)}
     permutations, signs = model.scene_symmetries(LATTICE, Scene.preset("slope"), list(ranges))
