@@ -95,7 +95,7 @@ def evaluate(net: HopNet, rows: HopData, whole: HopData, split: str, floor: int 
 
 def rows_of(config: EvaluateConfig, data: HopData, card: dict[str, Any]) -> HopData:
     """The hops that ``config.split`` names; DataFileError where the net was trained on another configuration."""
-    for name in ("model_version", "design", "scene", "lattice", "scene_ranges"):
+    for name in ("model_version", "design", "scene", "lattice", "scene_ranges", "fidelity"):
         if card["configuration"].get(name) != data.configuration.get(name):
             raise DataFileError(
                 f"{config.data}: expected {name} {card['configuration'].get(name)!r}, which the surrogate was trained on, "

@@ -67,7 +67,7 @@ def calibration(found: Evaluation) -> Figure:
 def error_map(net: HopNet, rows: HopData) -> Figure:
     """Error over the plane of landings, as medians of hexagons."""
     prediction, targets = of_data(net, rows).mean, target_columns(rows)
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.9), layout="constrained")
     for axis, (name, (x, y)) in zip(axes, PLANES.items(), strict=True):
         error = 1e3 * np.hypot(*(prediction - targets)[:, [x, y]].T)
         known = np.isfinite(error)

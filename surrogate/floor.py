@@ -11,6 +11,7 @@ from surrogate.dataset import HopData
 from surrogate.outputs import OUTPUTS
 from tensegrity_gym import STRETCH_RANGE, Design, HopResult, Lattice, Scene, form_find, simulate
 from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.types import Floats
 
 #: How far each node of the start is moved [m]; less than any builder can tell.
@@ -28,11 +29,12 @@ def measure_floor(data: HopData, hops: int) -> dict[str, dict[str, float]]:
     c = data.configuration
     if c.get("scene_ranges"):
         raise InvalidParameterError(f"floor: expected hops of one scene, got scenes that vary in {sorted(c['scene_ranges'])}")
-    settings: dict[str, Any] = {"design": Design(**c["design"]), "scene": Scene(**c["scene"]), "lattice": Lattice(**c["lattice"])}
-    how = {"dt": c["dt"], "precision": c["precision"], **settings}
+    settings: dict[str, Any] = {"scene": Scene(**c["scene"]), "lattice": Lattice(**c["lattice"])}
+    design, fidelity = Design(**c["design"]), Fidelity(**c.get("fidelity", {"precision": c["precision"]}))
+    how = {"dt": c["dt"], "design": design, "fidelity": fidelity, **settings}
     rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
     random = np.random.default_rng(0)
-    start = form_find(data["stretches"][rows], **settings)
+    start = form_find(data["stretches"][rows], design=fidelity.design(design), **settings)
     shift = random.normal(size=start.positions.shape)
     shift *= PERTURBATION / np.linalg.norm(shift, axis=2, keepdims=True)
     shift[:, :, 2] = np.where(start.positions[:, :, 2] + shift[:, :, 2] < 0, 0.0, shift[:, :, 2])
