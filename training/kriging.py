@@ -1,0 +1,96 @@
+"""What the surrogate misses, from the stored hops around each point: any number of hops, a few neighbours at a time.
+
+``surrogate.correction`` keeps one Gaussian process of all residuals, which a few hundred hops are the limit of. Landings are
+rough on a scale below the distance between thousands of hops, so only the nearest ones tell anything: here each point has
+a process of its own over these (Rasmussen and Williams 2006, eqs. 2.23-2.24 and section 8.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from surrogate.dataset import HopData
+from surrogate.model import HopNet, one_thread
+from tensegrity_gym.types import Floats
+
+LENGTHS = (0.02, 0.03, 0.045, 0.07, 0.1, 0.15, 0.3)  #: candidates of the length scale, in stretches
+NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  #: candidates of the noise's share of the variance
+NEIGHBOURS = 12
+#: Hops that the scale is chosen on, at most.
+MOST_HELD = 1000
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Hyper-parameters of the processes."""
+
+    length: float  #: in stretches
+    noise: float  #: share of the variance that no stored hop explains
+    sigma: float  #: standard deviation far from all hops, in each direction [m]
+    log_loss: float  #: mean negative log-likelihood (up to a constant) of the hops that it was chosen on
+
+
+class Kriging:
+    """Stretches (n, n_actuators) to a shift of the landing (n, 2) [m] and its variance in each direction (n,) [m^2].
+
+    Residuals (m, 2) [m] at stretches (m, n_actuators) are stored with their images under the symmetries, permutations
+    (g, n_actuators) and signs (g, 2).
+    """
+
+    def __init__(
+        self, stretches: Floats, residuals: Floats, permutations: np.ndarray, signs: np.ndarray, scale: Scale
+    ) -> None:
+        self.stretches = stretches[:, permutations].reshape(-1, stretches.shape[1])
+        self.residuals = (residuals[:, None] * signs).reshape(-1, 2)
+        self.tree, self.scale = KDTree(self.stretches), scale
+
+    def __call__(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
+        shift, share = self.shift(stretches.numpy().astype(np.float64))
+        variance = self.scale.sigma**2 * (share + self.scale.noise)
+        return torch.from_numpy(shift.astype(np.float32)), torch.from_numpy(variance.astype(np.float32))
+
+    def shift(self, at: Floats) -> tuple[Floats, Floats]:
+        """Expected residual (n, 2) [m] and the share of the variance that stays in doubt (n,), at stretches (n, n_actuators)."""
+        count = min(NEIGHBOURS, len(self.stretches))
+        distance, near = self.tree.query(at, count)
+        distance, near = distance.reshape(len(at), count), near.reshape(len(at), count)
+        points = self.stretches[near]  # (n, count, n_actuators)
+        kernel = self._kernel(np.linalg.norm(points[:, :, None] - points[:, None], axis=3))
+        seen = self._kernel(distance)
+        weights = np.linalg.solve(kernel + self.scale.noise * np.eye(count), seen[..., None])[..., 0]
+        shift = (weights[:, None] @ self.residuals[near])[:, 0]
+        return shift, np.clip(1 - (weights * seen).sum(axis=1), 0, 1)
+
+    def _kernel(self, distance: Floats) -> Floats:
+        return np.exp(-0.5 * (distance / self.scale.length) ** 2)
+
+
+@one_thread()
+@torch.no_grad()
+def fit_kriging(net: HopNet, data: HopData, validation: float, test: float) -> Kriging | None:
+    """Choose the scale on the hops that training stopped on, then store all that training saw; None if there are too few.
+
+    ``validation`` and ``test`` are the shares that the net was trained with.
+    """
+    split = data.split(validation, test)
+    known, held = split["train"], split["validation"][:MOST_HELD]
+    if len(known) < 2 or len(held) < 2:
+        return None
+    stretches = data["stretches"]
+    residuals = data["landing"] - net.landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy()
+    images = net.permutations.numpy(), net.signs[:, :2].numpy().astype(np.float64)
+    found = []
+    for length, noise in product(LENGTHS, NOISES):
+        process = Kriging(stretches[known], residuals[known], *images, Scale(length, noise, 1.0, 0.0))
+        shift, share = process.shift(stretches[held])
+        share = share[:, None] + noise
+        sigma = float(np.sqrt(((residuals[held] - shift) ** 2 / share).mean()))  # the likeliest, in closed form
+        found.append(Scale(length, noise, sigma, float(np.log(sigma**2 * share).mean())))
+    rows = np.sort(np.concatenate([known, split["validation"]]))
+    return Kriging(stretches[rows], residuals[rows], *images, min(found, key=lambda scale: scale.log_loss))
