@@ -83,7 +83,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Path) -> None:
     text = (folder / "results.md").read_text(encoding="utf-8")
-    for said in ("nearest stored hop", "best of 2 simulated", "SAC", "p95", "boundary", "fidelity single", "floor"):
+    for said in ("nearest stored hop", "best of 2 simulated", "SAC", "p95", "boundary", "fidelity flown", "floor"):
         assert said in text
     pictures = sorted(p.name for p in folder.glob("*.png"))
     assert pictures == [f"results_earth_touchdown_{kind}.png" for kind in ("calls", "pareto", "profile")]

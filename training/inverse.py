@@ -20,6 +20,8 @@ from training.planner import Prediction, targets_of
 LEAST_VARIANCE = 1e-10
 #: Step of the differences that derivatives are taken by [-].
 DIFFERENCE = 1e-3
+#: Expected errors closer than this are the same [m].
+LEAST_EQUAL = 1e-4
 #: Proposals differ in some stretch by at least this [-].
 DISTINCT = 0.01
 
@@ -30,14 +32,15 @@ class InverseConfig:
 
     pool: int = 4096
     """Spread-out stretches that the starts are chosen from."""
-    starts: int = 8
+    starts: int = 6
     """Descents per target."""
-    steps: int = 8
+    steps: int = 6
     """Steps per descent."""
     damping: float = 1e-4
     """Damping at the first step, as a share of the squared reach of the pool; it falls with every step that helps."""
-    equal: float = 0.002
-    """Answers whose expected error is within this of the least count as equals, among which the least energy wins [m]."""
+    equal: float = 0.05
+    """Answers whose expected error is above the least by no more than this share of it, or by ``LEAST_EQUAL``, count as equals,
+    among which the least energy wins [-]."""
     miss: float = 0.01
     """A target is called unreachable if the nearest known landing is farther away than this [m]."""
 
@@ -59,8 +62,8 @@ class Plans(NamedTuple):
 class InversePlanner:
     """Find the stretches whose expected squared landing error is least.
 
-    The expected square is that of the mean landing's distance to the target plus the variance: the members' spread and,
-    with a ``correction``, the doubt that distance from the stored hops brings. So among the many stretches that reach a
+    The expected square is that of the mean landing's distance to the target plus the variance: the members' spread or, with
+    a ``correction``, the doubt that distance from the stored hops brings. So among the many stretches that reach a
     target, a surface in the box, it takes those that it is surest of. Both are residuals of one least-squares problem,
     solved by Levenberg-Marquardt steps; stretches at the end of their range that would leave it are held there for the
     step, so that answers on the box's boundary are reached.
@@ -125,11 +128,10 @@ class InversePlanner:
         """Mean landing (n, 2) [m] and its variance, both directions added (n,) [m^2], at stretches (n, n_actuators)."""
         landings = self.landing(stretches)
         mean = landings.mean(dim=0)
-        variance = ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
         if self.correction is None:
-            return mean, variance
+            return mean, ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
         shift, doubt = self.correction(stretches)
-        return mean + shift, variance + 2 * doubt
+        return mean + shift, 2 * doubt
 
     @one_thread()
     @torch.no_grad()
@@ -180,7 +182,8 @@ class InversePlanner:
         assert self.energy is not None
         energies = torch.from_numpy(self.energy(_in_range(found).reshape(-1, found.shape[2]))).reshape(cost.shape)
         error = torch.sqrt(cost)
-        equals = error <= error.min(dim=1, keepdim=True).values + self.config.equal
+        least = error.min(dim=1, keepdim=True).values
+        equals = error <= torch.maximum((1 + self.config.equal) * least, least + LEAST_EQUAL)
         return torch.where(equals, energies, torch.inf).argmin(dim=1)
 
 

@@ -2,13 +2,13 @@
 
 ``surrogate.correction`` keeps one Gaussian process of all residuals, which a few hundred hops are the limit of. Landings are
 rough on a scale below the distance between thousands of hops, so only the nearest ones tell anything: here each point has
-a process of its own over these (Rasmussen and Williams 2006, eqs. 2.23-2.24 and section 8.3).
+a process of its own over these (Rasmussen and Williams 2006, eqs. 2.23-2.24 and section 8.3), with the Matérn kernel whose
+samples have one derivative (eq. 4.17), as the doubt about a landing grows in proportion to the way from a stored hop.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 import torch
@@ -19,9 +19,10 @@ from surrogate.dataset import HopData
 from surrogate.model import HopNet, one_thread
 from tensegrity_gym.types import Floats
 
-LENGTHS = (0.02, 0.03, 0.045, 0.07, 0.1, 0.15, 0.3)  #: candidates of the length scale, in stretches
-NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  #: candidates of the noise's share of the variance
-NEIGHBOURS = 12
+LENGTHS = (0.03, 0.05, 0.08, 0.12, 0.2, 0.4)  #: candidates of the length scale, in stretches
+NEIGHBOURS = 24
+#: Least share of the variance that counts as noise, so that kernel matrices have inverses.
+LEAST_NOISE = 1e-4
 #: Hops that the scale is chosen on, at most.
 MOST_HELD = 1000
 
@@ -43,9 +44,7 @@ class Kriging:
     (g, n_actuators) and signs (g, 2).
     """
 
-    def __init__(
-        self, stretches: Floats, residuals: Floats, permutations: np.ndarray, signs: np.ndarray, scale: Scale
-    ) -> None:
+    def __init__(self, stretches: Floats, residuals: Floats, permutations: np.ndarray, signs: np.ndarray, scale: Scale) -> None:
         self.stretches = stretches[:, permutations].reshape(-1, stretches.shape[1])
         self.residuals = (residuals[:, None] * signs).reshape(-1, 2)
         self.tree, self.scale = KDTree(self.stretches), scale
@@ -68,15 +67,17 @@ class Kriging:
         return shift, np.clip(1 - (weights * seen).sum(axis=1), 0, 1)
 
     def _kernel(self, distance: Floats) -> Floats:
-        return np.exp(-0.5 * (distance / self.scale.length) ** 2)
+        scaled = np.sqrt(3) * distance / self.scale.length
+        return (1 + scaled) * np.exp(-scaled)
 
 
 @one_thread()
 @torch.no_grad()
-def fit_kriging(net: HopNet, data: HopData, validation: float, test: float) -> Kriging | None:
+def fit_kriging(net: HopNet, data: HopData, validation: float, test: float, floor: float = 0.0) -> Kriging | None:
     """Choose the scale on the hops that training stopped on, then store all that training saw; None if there are too few.
 
-    ``validation`` and ``test`` are the shares that the net was trained with.
+    ``validation`` and ``test`` are the shares that the net was trained with, ``floor`` how far a landing moves, in each
+    direction, when nothing but the unknowable changes [m].
     """
     split = data.split(validation, test)
     known, held = split["train"], split["validation"][:MOST_HELD]
@@ -85,8 +86,9 @@ def fit_kriging(net: HopNet, data: HopData, validation: float, test: float) -> K
     stretches = data["stretches"]
     residuals = data["landing"] - net.landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy()
     images = net.permutations.numpy(), net.signs[:, :2].numpy().astype(np.float64)
+    noise = max(LEAST_NOISE, float(floor**2 / np.mean(residuals[held] ** 2)))
     found = []
-    for length, noise in product(LENGTHS, NOISES):
+    for length in LENGTHS:
         process = Kriging(stretches[known], residuals[known], *images, Scale(length, noise, 1.0, 0.0))
         shift, share = process.shift(stretches[held])
         share = share[:, None] + noise

@@ -56,13 +56,13 @@ class BatchedHopVecEnv(DummyVecEnv):
 
     Targets, seeds, spaces and observations are the envs' own, rewards come from the same function that they call; only
     ``simulate`` is called once for all of them. Infos hold ``landing`` (2,) [m], ``error`` [m] and ``status``.
-    ``fidelity``: as the env's.
+    ``levers``: further arguments of ``simulate``.
     """
 
-    def __init__(self, scene: Scene, scale: float, envs: int, fidelity: str | Mapping[str, Any] = "paper") -> None:
+    def __init__(self, scene: Scene, scale: float, envs: int, levers: Mapping[str, Any] | None = None) -> None:
         makers: Sequence[Callable[[], gym.Env]] = [lambda: make_env(scene, scale)] * envs
         super().__init__(list(makers))
-        self.scene, self.levers = scene, task.check_fidelity(fidelity)
+        self.scene, self.levers = scene, dict(levers or {})
         #: Hops simulated since the envs were made.
         self.simulator_calls = 0
         #: Wall time that simulating them took [s].

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from surrogate.model import NetConfig
 from surrogate.train import TrainConfig
 from tensegrity_gym.errors import InvalidParameterError
 from training.inverse import InverseConfig
@@ -24,7 +25,7 @@ class CompareConfig:
     landing: str = "touchdown"
     """Where a landing is read: touchdown or rest."""
     fidelity: str = "paper"
-    """Model of the hop, for learning and for scoring alike: paper, or single (precision)."""
+    """Model of the hop, for learning and for scoring alike, see training/models.py: paper, single (precision), or flown."""
     duration: float | None = None
     """Longest time that a hop is followed [s]; None: the scene's. A touchdown needs no more than the longest flight."""
     data: Path | None = None
@@ -54,14 +55,18 @@ class CompareConfig:
     """Hops per target of CMA-ES on the simulator; 0: no oracle."""
     updates: int = 3000
     """Gradient steps of the surrogate, at most."""
-    surrogate: TrainConfig = field(default_factory=lambda: TrainConfig(test=0.0))
-    """Training of the surrogate."""
+    surrogate: TrainConfig = field(
+        default_factory=lambda: TrainConfig(net=NetConfig(hidden=(64, 64, 64)), test=0.0, device="cpu")
+    )
+    """Training of the surrogate, which is small, since a planner asks it often and stored hops tell the rest."""
     inverse: InverseConfig = field(default_factory=InverseConfig)
     """Inversion of the surrogate."""
     tandem: TandemConfig = field(default_factory=TandemConfig)
     """Training of the tandem net."""
     latencies: int = 100
     """Single questions that each method's latency is measured on; 0: none."""
+    threads: int | None = None
+    """Threads of the simulator; None: all cores."""
     write: bool = False
     """Write tables and figures into docs/results.md, docs/images and README.md of the working directory."""
     quick: bool = False
@@ -85,7 +90,7 @@ class CompareConfig:
         return replace(
             self,
             out=self.out / "quick",
-            fidelity="single",
+            fidelity="flown",
             duration=0.06,
             data=None,
             budgets=(16, 32),

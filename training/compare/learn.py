@@ -7,18 +7,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from surrogate import dataset, model
-from surrogate.correction import MOST_HOPS, fit_correction
 from surrogate.dataset import Configuration, HopData
 from surrogate.model import HopNet
-from surrogate.train import TrainConfig, train
+from surrogate.train import train
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.frozen import FrozenLanding
 from training.inverse import InversePlanner, fit_energy
+from training.kriging import fit_kriging
 from training.planner import NearestHopPlanner, Planner
 from training.tandem import TandemPlanner
 
@@ -54,10 +57,7 @@ def from_file(path: Path, scene: Scene, seed: int, most: int) -> HopData:
 
 def fit_net(data: HopData, config: CompareConfig, seed: int) -> tuple[HopNet, float]:
     """The surrogate trained on ``data``, and how long that took [s]."""
-    settings: TrainConfig = config.surrogate
-    per_epoch = -(-len(data) // settings.batch)
-    epochs = max(1, min(settings.epochs, config.updates // per_epoch))
-    settings = replace(settings, seed=seed, epochs=epochs, patience=max(1, min(settings.patience, epochs)))
+    settings = replace(config.surrogate, seed=seed, steps=min(config.surrogate.steps, config.updates))
     net, card = train(data, settings, progress=config.progress, desc=f"surrogate of {len(data)} hops")
     return net, float(card["seconds"])
 
@@ -77,10 +77,11 @@ class Fitted:
         return found
 
 
-def fit_planners(net: HopNet, data: HopData, config: CompareConfig, seed: int) -> Fitted:
-    """All planners from the hops in ``data`` and the surrogate trained on them."""
+def fit_planners(net: HopNet, data: HopData, config: CompareConfig, seed: int, floor: float) -> Fitted:
+    """All planners from the hops in ``data`` and the surrogate trained on them; ``floor`` [m] as in ``fit_kriging``."""
     data = data.rows(data.usable)
     seconds = {}
+    landing = FrozenLanding(net)
 
     def timed(name: str, make):  # type: ignore[no-untyped-def]
         started = time.perf_counter()
@@ -89,22 +90,24 @@ def fit_planners(net: HopNet, data: HopData, config: CompareConfig, seed: int) -
         return made
 
     def ensemble() -> InversePlanner:
-        # the process of the residuals keeps but so many hops: where it cannot hold them all it has little to add
-        fitted = None
-        if len(data) <= MOST_HOPS:
-            fitted = fit_correction(net, data, config.surrogate.validation, config.surrogate.test)
+        correction = fit_kriging(net, data, config.surrogate.validation, config.surrogate.test, floor)
         return InversePlanner(
-            net.landing,
+            landing,
             config.inverse,
-            correction=None if fitted is None else fitted[0],
+            correction=correction,
             energy=fit_energy(data["stretches"], data["stored_energy"]),
             stored=data["stretches"],
             seed=seed,
         )
 
+    def by_net(stretches: Tensor) -> tuple[Tensor, Tensor]:
+        landings = landing(stretches)
+        mean = landings.mean(dim=0)
+        return mean, ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
+
     def tandem() -> TandemPlanner:
         return TandemPlanner(
-            lambda s: robust.see(s),
+            by_net,
             data["landing"],
             replace(config.tandem, seed=seed),
             permutations=net.permutations.numpy(),
@@ -112,18 +115,19 @@ def fit_planners(net: HopNet, data: HopData, config: CompareConfig, seed: int) -
         )
 
     nearest = timed("nearest", lambda: NearestHopPlanner(data["stretches"], data["landing"]))
-    single = timed("single", lambda: InversePlanner(lambda s: net.landing(s)[:1], config.inverse, stored=data["stretches"]))
+    single = timed("single", lambda: InversePlanner(lambda s: landing(s)[:1], config.inverse, stored=data["stretches"]))
     robust = timed("ensemble", ensemble)
     planners: dict[str, Planner] = {"nearest": nearest, "single": single, "ensemble": robust, "tandem": timed("tandem", tandem)}
     search = EvolutionConfig(evaluations=config.search, seed=seed)
-    planners["cma"] = EvolutionPlanner(lambda s: mean_landing(net, s), nearest, search)
+    planners["cma"] = EvolutionPlanner(lambda s: mean_landing(landing, s), nearest, search)
     seconds["cma"] = seconds["nearest"]
     return Fitted(planners, seconds)
 
 
-def mean_landing(net: HopNet, stretches: np.ndarray) -> np.ndarray:
+@torch.no_grad()
+def mean_landing(landing: FrozenLanding, stretches: np.ndarray) -> np.ndarray:
     """The ensemble's landing of stretches (n, n_actuators), shape (n, 2) [m]."""
-    return net.predict(stretches)[0][:, :2].astype(np.float64)
+    return landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy().astype(np.float64)
 
 
 def save_net(net: HopNet, path: Path, data: HopData, seconds: float) -> None:

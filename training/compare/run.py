@@ -16,12 +16,12 @@ from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
 from tensegrity_gym import Scene
-from tensegrity_gym.task import check_fidelity
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
 from training.compare.learn import PLANNERS, Fitted, fit_net, fit_planners, from_file, save_net, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.models import levers_of
 from training.planner import BestOfPlanner, NearestHopPlanner, Planner
 from training.policies import ActorPolicy
 from training.stages import Results, Stages
@@ -41,7 +41,7 @@ class Comparison:
         self.config = config
         changes = {} if config.duration is None else {"duration": config.duration}
         self.scene = Scene.preset(config.scene, landing=config.landing, **changes)
-        self.hops = Hops(self.scene, check_fidelity(config.fidelity))
+        self.hops = Hops(self.scene, levers_of(config.fidelity), config.threads)
         self.stages = Stages(Path(config.out), say=print if config.progress else lambda _: None)
         self.places = registered.read(config.scene, config.landing, config.targets)
         self.targets = np.concatenate(list(self.places.values()))
@@ -101,12 +101,17 @@ class Comparison:
 
         self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, work)
 
+    @property
+    def floor(self) -> float:
+        """How far moved starts land from where the unmoved one does, root mean square in each direction [m]."""
+        return float(np.sqrt(np.mean(np.square(self.stages.results["floor"]["distances"])) / 2))
+
     def fitted(self, seed: int, budget: int) -> Fitted:
         """Planners of a seed and budget."""
         if (seed, budget) not in self._fitted:
             data = self.pool(seed).rows(slice(0, budget))
             net, _ = model.load(self.stages.folder / f"net_{seed}_{budget}.safetensors")
-            self._fitted = {(seed, budget): fit_planners(net, data, self.config, seed)}
+            self._fitted = {(seed, budget): fit_planners(net, data, self.config, seed, self.floor)}
         return self._fitted[seed, budget]
 
     def _planners(self, seed: int, budget: int) -> None:
@@ -130,7 +135,7 @@ class Comparison:
             }
 
         settings = {"inverse": asdict(config.inverse), "tandem": asdict(config.tandem), "planners": self.names}
-        self.stages.run(f"plans_{tag}", settings | {"targets": self.targets.tolist()}, plan, needs=[f"net_{tag}"])
+        self.stages.run(f"plans_{tag}", settings | {"targets": self.targets.tolist()}, plan, needs=[f"net_{tag}", "floor"])
         for name in self.names:
             self._score(name, seed, budget, f"plans_{tag}", partial(self._kept, f"plans_{tag}", name))
 
