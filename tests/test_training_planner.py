@@ -9,10 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
+from surrogate.model import HopNet, NetConfig, scene_symmetries
+from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.frozen import FrozenLanding
 from training.inverse import InverseConfig, InversePlanner, fit_energy
+from training.kriging import fit_kriging
 from training.planner import BestOfPlanner, NearestHopPlanner, targets_of
 from training.policies import ActorPolicy, _mlp
 from training.tandem import TandemConfig, TandemPlanner
@@ -202,3 +207,58 @@ def test_actor_round_trip_and_refusals(tmp_path: Path) -> None:
         ActorPolicy.load(path)
     with pytest.raises(DataFileError, match="readable JSON"):
         ActorPolicy.load(tmp_path / "absent.safetensors")
+
+
+def small_net() -> HopNet:
+    """An untrained net of the 2x2 lattice on flat ground, with outputs of the size of landings."""
+    torch.manual_seed(0)
+    net = HopNet(NetConfig(hidden=(8, 8), members=2), *scene_symmetries(Lattice(2, 2), Scene()))
+    net.output_scale.copy_(torch.linspace(0.1, 0.9, len(net.output_scale)))
+    return net.eval()
+
+
+def test_frozen_net_lands_where_the_net_does() -> None:
+    net = small_net()
+    stretches = torch.from_numpy(sample_stretches(50, 1).astype(np.float32))
+    with torch.no_grad():
+        torch.testing.assert_close(FrozenLanding(net)(stretches), net.landing(stretches), rtol=0, atol=1e-6)
+
+
+def rough_data(net: HopNet, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stretches, landings that the net misses by waves of 5 mm, as equivariant as it is, and these residuals."""
+    stretches = sample_stretches(count, seed)
+    with torch.no_grad():
+        smooth = net.landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy()
+    images = stretches[:, net.permutations.numpy()]
+    wave = np.stack([np.sin(30 * images[..., 0]), np.cos(25 * images[..., 1])], axis=2)
+    residual = 0.005 * (wave * net.signs[:, :2].numpy()).mean(axis=1)
+    return stretches, smooth + residual, residual
+
+
+def test_kriging_finds_what_the_net_misses_and_knows_how_well() -> None:
+    net = small_net()
+    stretches, landings, residuals = rough_data(net, 3000, 0)
+    columns = {
+        "index": np.arange(3000),
+        "image": np.zeros(3000),
+        "stretches": stretches,
+        "landing": landings,
+        "split_share": np.random.default_rng(0).random(3000),
+        "status": np.zeros(3000, dtype=int),
+    }
+    process = fit_kriging(net, HopData(columns, {}), 0.1, 0.0)
+    assert process is not None
+    at, _, missed = rough_data(net, 500, 99)
+    shift, variance = process(torch.from_numpy(at.astype(np.float32)))
+    left = missed - shift.numpy()
+    assert np.sqrt((left**2).mean()) < 0.3 * np.sqrt((missed**2).mean())
+    assert np.sqrt(variance.mean().item()) == pytest.approx(np.sqrt((left**2).mean()), rel=0.3)
+    # at a stored hop, and at its image under a symmetry, there is next to nothing left to doubt
+    known, doubt = process(torch.from_numpy(stretches[:20].astype(np.float32)))
+    np.testing.assert_allclose(known.numpy(), residuals[:20], atol=2e-4)
+    assert doubt.max() < 0.1 * variance.mean()
+    permutation, sign = net.permutations[1].numpy(), net.signs[1, :2].numpy()
+    image, _ = process(torch.from_numpy(stretches[:20][:, permutation].astype(np.float32)))
+    np.testing.assert_allclose(image.numpy(), sign * known.numpy(), atol=2e-4)
+    few = HopData({k: v[:3] for k, v in columns.items()}, {})
+    assert fit_kriging(net, few, 0.0, 0.0) is None
