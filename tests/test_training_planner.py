@@ -20,6 +20,7 @@ from training.inverse import InverseConfig, InversePlanner, fit_energy
 from training.kriging import fit_kriging
 from training.planner import BestOfPlanner, NearestHopPlanner, targets_of
 from training.policies import ActorPolicy, _mlp
+from training.refine import RefiningPlanner
 from training.tandem import TandemConfig, TandemPlanner
 
 
@@ -260,5 +261,23 @@ def test_kriging_finds_what_the_net_misses_and_knows_how_well() -> None:
     permutation, sign = net.permutations[1].numpy(), net.signs[1, :2].numpy()
     image, _ = process(torch.from_numpy(stretches[:20][:, permutation].astype(np.float32)))
     np.testing.assert_allclose(image.numpy(), sign * known.numpy(), atol=2e-4)
+    # each hop tells the next plan how the map runs there, down to the noise that kriging was told of
+    truth = np.random.default_rng(5).uniform(0.25, 0.75, (8, 4))
+
+    def real(stretches: np.ndarray) -> np.ndarray:
+        images = stretches[:, net.permutations.numpy()]
+        wave = np.stack([np.sin(30 * images[..., 0]), np.cos(25 * images[..., 1])], axis=2)
+        smooth = FrozenLanding(net)(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).detach().numpy()
+        return smooth + 0.005 * (wave * net.signs[:, :2].numpy()).mean(axis=1)
+
+    coarse = fit_kriging(net, HopData({k: v[:300] for k, v in columns.items()}, {}), 0.1, 0.0)
+    planner = InversePlanner(net.landing, correction=coarse, stored=stretches[:300])
+    once, eight = (RefiningPlanner(planner, real, tries) for tries in (1, 8))
+    errors = [np.linalg.norm(real(p.predict(real(truth))[0]) - real(truth), axis=1) for p in (once, eight)]
+    assert np.median(errors[1]) < 0.2 * np.median(errors[0])
+    assert np.median(errors[1]) < 1e-4
+    assert eight.simulator_calls == 64
+    with pytest.raises(InvalidParameterError, match="kriging"):
+        RefiningPlanner(InversePlanner(net.landing), real, 2).predict(real(truth))
     few = HopData({k: v[:3] for k, v in columns.items()}, {})
     assert fit_kriging(net, few, 0.0, 0.0) is None

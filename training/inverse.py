@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from surrogate.generate import sample_stretches
 from surrogate.model import one_thread
 from tensegrity_gym import STRETCH_RANGE
 from tensegrity_gym.errors import InvalidParameterError
+from training.kriging import Kriging
 from training.planner import Prediction, targets_of
 
 #: Added to the variance under the root, so that its derivative exists where it is zero [m^2].
@@ -123,6 +125,20 @@ class InversePlanner:
         order = cost.argsort(dim=1)
         found = torch.gather(found, 1, order[..., None].expand_as(found))
         return np.stack([_distinct(row, count) for row in _in_range(found)])
+
+    @torch.no_grad()
+    def told(self, stretches: np.ndarray, landings: np.ndarray) -> InversePlanner:
+        """A planner that knows where more hops landed, shapes (m, n_actuators) and (m, 2) [m]; its correction must be Kriging."""
+        if not isinstance(self.correction, Kriging):
+            raise InvalidParameterError("told: expected a planner with kriging as its correction, which alone learns from hops")
+        points, there = (torch.from_numpy(np.asarray(a, dtype=np.float32)) for a in (stretches, landings))
+        more = copy.copy(self)
+        missed = landings - self.landing(points).mean(dim=0).numpy()
+        more.correction = self.correction.told(np.asarray(stretches), missed)
+        more.pool = torch.cat([self.pool, points])
+        mean, variance = self.pool_seen
+        more.pool_seen = torch.cat([mean, there]), torch.cat([variance, torch.zeros(len(points))])
+        return more
 
     def see(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
         """Mean landing (n, 2) [m] and its variance, both directions added (n,) [m^2], at stretches (n, n_actuators)."""

@@ -45,9 +45,18 @@ class Kriging:
     """
 
     def __init__(self, stretches: Floats, residuals: Floats, permutations: np.ndarray, signs: np.ndarray, scale: Scale) -> None:
+        self.permutations, self.signs, self.scale = permutations, signs, scale
         self.stretches = stretches[:, permutations].reshape(-1, stretches.shape[1])
         self.residuals = (residuals[:, None] * signs).reshape(-1, 2)
-        self.tree, self.scale = KDTree(self.stretches), scale
+        self.tree = KDTree(self.stretches)
+
+    def told(self, stretches: Floats, residuals: Floats) -> Kriging:
+        """With more hops, shapes (m, n_actuators) and (m, 2) [m]."""
+        more = Kriging(stretches, residuals, self.permutations, self.signs, self.scale)
+        more.stretches = np.concatenate([more.stretches, self.stretches])
+        more.residuals = np.concatenate([more.residuals, self.residuals])
+        more.tree = KDTree(more.stretches)
+        return more
 
     def __call__(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
         shift, share = self.shift(stretches.numpy().astype(np.float64))
