@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -62,66 +64,65 @@ def fit_net(data: HopData, config: CompareConfig, seed: int) -> tuple[HopNet, fl
     return net, float(card["seconds"])
 
 
-@dataclass(frozen=True)
 class Fitted:
-    """Planners made from the same hops, and what making each took beyond simulating and the surrogate [s]."""
+    """Planners made, when they are asked for, from the hops in ``data`` and the surrogate trained on them.
 
-    planners: dict[str, Planner]
-    seconds: dict[str, float]
+    ``floor`` [m] as in ``fit_kriging``.
+    """
 
-    @property
+    def __init__(self, net: HopNet, data: HopData, config: CompareConfig, seed: int, floor: float) -> None:
+        self.net, self.data, self.config, self.seed, self.floor = net, data.rows(data.usable), config, seed, floor
+        self.landing = FrozenLanding(net)
+        #: What making each planner took beyond simulating and the surrogate [s].
+        self.seconds: dict[str, float] = {}
+        self._made: dict[str, Planner] = {}
+
+    def __getitem__(self, name: str) -> Planner:
+        if name not in self._made:
+            started = time.perf_counter()
+            make: dict[str, Callable[[], Planner]] = {
+                "nearest": lambda: NearestHopPlanner(self.data["stretches"], self.data["landing"]),
+                "single": lambda: InversePlanner(
+                    lambda s: self.landing(s)[:1], self.config.inverse, stored=self.data["stretches"]
+                ),
+                "ensemble": lambda: self.inverse,
+                "tandem": self._tandem,
+                "cma": self._evolution,
+            }
+            self._made[name] = make[name]()
+            self.seconds[name] = time.perf_counter() - started
+        return self._made[name]
+
+    @cached_property
     def inverse(self) -> InversePlanner:
         """The robust planner, which others build on."""
-        found = self.planners["ensemble"]
-        assert isinstance(found, InversePlanner)
-        return found
-
-
-def fit_planners(net: HopNet, data: HopData, config: CompareConfig, seed: int, floor: float) -> Fitted:
-    """All planners from the hops in ``data`` and the surrogate trained on them; ``floor`` [m] as in ``fit_kriging``."""
-    data = data.rows(data.usable)
-    seconds = {}
-    landing = FrozenLanding(net)
-
-    def timed(name: str, make):  # type: ignore[no-untyped-def]
-        started = time.perf_counter()
-        made = make()
-        seconds[name] = time.perf_counter() - started
-        return made
-
-    def ensemble() -> InversePlanner:
-        correction = fit_kriging(net, data, config.surrogate.validation, config.surrogate.test, floor)
+        stretches, shares = self.data["stretches"], (self.config.surrogate.validation, self.config.surrogate.test)
         return InversePlanner(
-            landing,
-            config.inverse,
-            correction=correction,
-            energy=fit_energy(data["stretches"], data["stored_energy"]),
-            stored=data["stretches"],
-            seed=seed,
+            self.landing,
+            self.config.inverse,
+            correction=fit_kriging(self.net, self.data, *shares, self.floor),
+            energy=fit_energy(stretches, self.data["stored_energy"]),
+            stored=stretches,
+            seed=self.seed,
         )
 
-    def by_net(stretches: Tensor) -> tuple[Tensor, Tensor]:
-        landings = landing(stretches)
-        mean = landings.mean(dim=0)
-        return mean, ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
+    def _tandem(self) -> TandemPlanner:
+        def see(stretches: Tensor) -> tuple[Tensor, Tensor]:
+            landings = self.landing(stretches)
+            mean = landings.mean(dim=0)
+            return mean, ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
 
-    def tandem() -> TandemPlanner:
         return TandemPlanner(
-            by_net,
-            data["landing"],
-            replace(config.tandem, seed=seed),
-            permutations=net.permutations.numpy(),
-            signs=net.signs[:, :2].numpy(),
+            see,
+            self.data["landing"],
+            replace(self.config.tandem, seed=self.seed),
+            permutations=self.net.permutations.numpy(),
+            signs=self.net.signs[:, :2].numpy(),
         )
 
-    nearest = timed("nearest", lambda: NearestHopPlanner(data["stretches"], data["landing"]))
-    single = timed("single", lambda: InversePlanner(lambda s: landing(s)[:1], config.inverse, stored=data["stretches"]))
-    robust = timed("ensemble", ensemble)
-    planners: dict[str, Planner] = {"nearest": nearest, "single": single, "ensemble": robust, "tandem": timed("tandem", tandem)}
-    search = EvolutionConfig(evaluations=config.search, seed=seed)
-    planners["cma"] = EvolutionPlanner(lambda s: mean_landing(landing, s), nearest, search)
-    seconds["cma"] = seconds["nearest"]
-    return Fitted(planners, seconds)
+    def _evolution(self) -> EvolutionPlanner:
+        search = EvolutionConfig(evaluations=self.config.search, seed=self.seed)
+        return EvolutionPlanner(lambda s: mean_landing(self.landing, s), self["nearest"], search)
 
 
 @torch.no_grad()

@@ -63,7 +63,7 @@ def in_detail(outcome: Outcome) -> str:
                 f"{outcome.improvement('ensemble', m, budget):.2f}" if comparable else "",
                 *(["", ""] if times is None else [f"{1e3 * t:.2g}" for t in times]),
                 f"{outcome.learning_seconds(m, budget):.3g}",
-                m.removeprefix("best") if m.startswith("best") else "0",
+                m.removeprefix("best").removeprefix("refine") if m.startswith(("best", "refine")) else "0",
             ]
         )
     head = [

@@ -26,7 +26,11 @@ LABELS = {
 
 def label(method: str) -> str:
     """A method's name in tables and figures."""
-    return f"the same, best of {method[4:]} simulated" if method.startswith("best") else LABELS.get(method, method)
+    if method.startswith("best"):
+        return f"the same, best of {method[4:]} simulated"
+    if method.startswith("refine"):
+        return f"the same, {method[6:]} simulated in turn, each told to the next"
+    return LABELS.get(method, method)
 
 
 def _place(method: str) -> tuple[int, int]:
@@ -34,6 +38,8 @@ def _place(method: str) -> tuple[int, int]:
     known = list(LABELS)
     if method.startswith("best"):
         return known.index("ensemble"), int(method[4:])
+    if method.startswith("refine"):
+        return known.index("ensemble"), 1000 + int(method[6:])
     return (known.index(method) if method in known else len(known)), 0
 
 
@@ -134,7 +140,7 @@ class Outcome:
                 times.append(record["seconds"] - record["simulating"])
             else:
                 plans = self.records[f"plans_{tag}"]
-                own = plans.get("ensemble" if method.startswith("best") else method, {"seconds": 0.0})["seconds"]
+                own = plans["ensemble" if method.startswith(("best", "refine")) else method]["seconds"]
                 times.append(own + (0.0 if method == "nearest" else self.seconds[f"net_{tag}"]))
         return float(np.mean(times))
 

@@ -19,11 +19,13 @@ from tensegrity_gym import Scene
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
-from training.compare.learn import PLANNERS, Fitted, fit_net, fit_planners, from_file, save_net, simulated
+from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, save_net, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.kriging import Kriging
 from training.models import levers_of
 from training.planner import BestOfPlanner, NearestHopPlanner, Planner
 from training.policies import ActorPolicy
+from training.refine import RefiningPlanner
 from training.stages import Results, Stages
 
 #: Hops of a pool that are simulated, and kept, together.
@@ -59,6 +61,8 @@ class Comparison:
                 self._planners(seed, budget)
                 if seed < (config.seeds if config.tries_seeds is None else config.tries_seeds):
                     self._best_of(seed, budget)
+                if config.refine:
+                    self._refined(seed, budget)
         self._oracle()
         for seed in range(config.seeds if config.policy_seeds is None else config.policy_seeds):
             for budget in config.budgets_of_policies:
@@ -111,7 +115,7 @@ class Comparison:
         if (seed, budget) not in self._fitted:
             data = self.pool(seed).rows(slice(0, budget))
             net, _ = model.load(self.stages.folder / f"net_{seed}_{budget}.safetensors")
-            self._fitted = {(seed, budget): fit_planners(net, data, self.config, seed, self.floor)}
+            self._fitted = {(seed, budget): Fitted(net, data, self.config, seed, self.floor)}
         return self._fitted[seed, budget]
 
     def _planners(self, seed: int, budget: int) -> None:
@@ -129,10 +133,8 @@ class Comparison:
 
         def plan() -> Results:
             fitted = self.fitted(seed, budget)
-            return {
-                name: {"stretches": fitted.planners[name].predict(self.targets)[0].tolist(), "seconds": fitted.seconds[name]}
-                for name in self.names
-            }
+            answers = {name: fitted[name].predict(self.targets)[0].tolist() for name in self.names}
+            return {name: {"stretches": answers[name], "seconds": fitted.seconds[name]} for name in self.names}
 
         settings = {"inverse": asdict(config.inverse), "tandem": asdict(config.tandem), "planners": self.names}
         self.stages.run(f"plans_{tag}", settings | {"targets": self.targets.tolist()}, plan, needs=[f"net_{tag}", "floor"])
@@ -166,6 +168,18 @@ class Comparison:
         self.stages.run(f"best_{tag}", {"tries": self.config.tries}, work, needs=[f"plans_{tag}"])
         for tries in self.config.tries:
             self._score(f"best{tries}", seed, budget, f"best_{tag}", partial(self._kept, f"best_{tag}", str(tries)))
+
+    def _refined(self, seed: int, budget: int) -> None:
+        tag, tries = f"{seed}_{budget}", self.config.refine
+
+        def work() -> Results:
+            inverse = self.fitted(seed, budget).inverse
+            if not isinstance(inverse.correction, Kriging):  # too few hops to tell how rough the map is
+                return {"stretches": None}
+            return {"stretches": RefiningPlanner(inverse, self.hops.land, tries).predict(self.targets)[0].tolist()}
+
+        if self.stages.run(f"refine_{tag}", {"tries": tries}, work, needs=[f"plans_{tag}"])["stretches"] is not None:
+            self._score(f"refine{tries}", seed, budget, f"refine_{tag}", lambda: self.stages.results[f"refine_{tag}"])
 
     def _oracle(self) -> None:
         if not self.config.oracle or not find_spec("cma"):
@@ -226,17 +240,20 @@ class Comparison:
 
         def work() -> Results:
             fitted = self.fitted(0, budget)
-            asked: dict[str, Planner] = {name: fitted.planners[name] for name in self.names}
+            asked: dict[str, Planner] = {name: fitted[name] for name in self.names}
             asked |= {f"best{t}": BestOfPlanner(fitted.inverse, self.hops.land, t) for t in self.config.tries}
+            if self.config.refine and isinstance(fitted.inverse.correction, Kriging):
+                asked[f"refine{self.config.refine}"] = RefiningPlanner(fitted.inverse, self.hops.land, self.config.refine)
             asked |= {a: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for a, name in policies.items()}
             return {name: self._questions(planner, name) for name, planner in asked.items()}
 
         needs = [f"net_0_{budget}", *policies.values()]
-        self.stages.run("latency", {"questions": self.config.latencies, "tries": self.config.tries}, work, needs=needs)
+        content = {"questions": self.config.latencies, "tries": self.config.tries, "refine": self.config.refine}
+        self.stages.run("latency", content, work, needs=needs)
 
     def _questions(self, planner: Planner, name: str) -> list[float]:
         """Wall times of single questions [s], after two to warm up."""
-        slow = name.startswith("best")
+        slow = name.startswith(("best", "refine"))
         count = max(2, self.config.latencies // 10) if slow else self.config.latencies
         rng = np.random.default_rng(LATENCY_SEED)
         inside = self.places["inside"]
