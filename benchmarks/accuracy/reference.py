@@ -162,7 +162,7 @@ def _witness_lines(d: Data) -> list[str]:
     head = "hop  step  take-off [us]  launch [mm/s]  touchdown [us]  touchdown [mm]  contact events"
     if not rows:
         return []
-    own = [error(d[f"tight/{name}"], d[f"witness/0/{name}"]) for name in ("launch", "touchdown")]
+    own = [float(np.linalg.norm(d[f"tight/{name}"] - d[f"witness/0/{name}"])) for name in ("launch", "touchdown")]
     lines = [f"DOP853 with tenfold tolerances from itself, hop 0: {1e3 * own[0]:.2g} mm/s, {1e3 * own[1]:.2g} mm at touchdown"]
     return ["", "against DOP853 between contact events", *table(head, rows), *lines]
 
