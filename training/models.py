@@ -7,7 +7,7 @@ from typing import Any
 from tensegrity_gym.task import check_fidelity
 
 #: The paper's model in single precision, which flies rigidly between take-off and touchdown and stops where the landing is
-#: read: several times cheaper, and its landings lie within the floor of the paper's.
+#: read: several times cheaper.
 FLOWN = {"precision": "float32", "flight": "rigid", "stop": "landing"}
 
 

@@ -22,7 +22,7 @@ MARKERS = ("o", "s", "^", "v", "D", "P", "X", "<", ">", "*")
 
 
 def _style() -> AbstractContextManager[None]:
-    return plt.rc_context(STYLE | {"figure.dpi": 110})  # type: ignore[arg-type]
+    return plt.rc_context(STYLE | {"figure.dpi": 95})  # type: ignore[arg-type]
 
 
 def _look(k: int) -> dict[str, object]:
@@ -39,7 +39,7 @@ def _levels(axes: Axes, outcome: Outcome, along: str = "y") -> None:
 def sample_efficiency(outcome: Outcome, path: Path) -> Path:
     """Interquartile mean error against simulator calls, with its 95 % interval."""
     with _style():
-        figure, axes = plt.subplots(figsize=(8, 4.8), layout="constrained")
+        figure, axes = plt.subplots(figsize=(9, 4.6), layout="constrained")
         for k, method in enumerate(outcome.methods):
             budgets = outcome.budgets(method)
             found = [outcome.summary(method, b) for b in budgets]
@@ -58,7 +58,7 @@ def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
     """Share of landings within a radius of the target, at one budget."""
     radii = np.geomspace(1e-4, 2 * outcome.reach, 200)
     with _style():
-        figure, axes = plt.subplots(figsize=(8, 4.4), layout="constrained")
+        figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
         for method in (m for m in outcome.methods if budget in outcome.budgets(m)):
             share = performance_profile(outcome.landing_errors(method, budget, "inside"), radii)
             look = _look(outcome.methods.index(method)) | {"marker": None}
@@ -73,7 +73,7 @@ def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
 def pareto(outcome: Outcome, path: Path) -> Path:
     """Time spent learning against error, one point per method and budget; larger marks are larger budgets."""
     with _style():
-        figure, axes = plt.subplots(figsize=(8, 4.8), layout="constrained")
+        figure, axes = plt.subplots(figsize=(9, 4.6), layout="constrained")
         for k, method in enumerate(outcome.methods):
             budgets = outcome.budgets(method)
             seconds = [max(outcome.learning_seconds(method, b), 1e-3) for b in budgets]

@@ -26,6 +26,11 @@ def _cell(found: Summary) -> str:
     return middle if found.seeds == 1 else f"{middle} [{1e3 * found.low:.3g}, {1e3 * found.high:.3g}]"
 
 
+def _plain(value: float) -> str:
+    """Two digits and no exponent."""
+    return f"{float(f'{value:.2g}'):.6g}" if value >= 1e-3 else "0"
+
+
 def by_budget(outcome: Outcome) -> str:
     """Interquartile mean errors on targets inside, by method and budget [mm]."""
     budgets = sorted({b for m in outcome.methods for b in outcome.budgets(m)})
@@ -61,8 +66,8 @@ def in_detail(outcome: Outcome) -> str:
                 f"{1e3 * found.p95:.3g}",
                 f"{100 * found.missed:.1f}",
                 f"{outcome.improvement('ensemble', m, budget):.2f}" if comparable else "",
-                *(["", ""] if times is None else [f"{1e3 * t:.2g}" for t in times]),
-                f"{outcome.learning_seconds(m, budget):.3g}",
+                *(["", ""] if times is None else [_plain(1e3 * t) for t in times]),
+                _plain(outcome.learning_seconds(m, budget)),
                 m.removeprefix("best").removeprefix("refine") if m.startswith(("best", "refine")) else "0",
             ]
         )
@@ -90,7 +95,7 @@ def section(outcome: Outcome, pictures: str) -> str:
     if outcome.oracle is not None:
         calls = outcome.records["oracle"]["calls_per_answer"]
         oracle = f" CMA-ES on the simulator, {calls:.0f} hops a target, reaches {1e3 * outcome.oracle:.3g} mm."
-    budget = max(b for m in outcome.methods for b in outcome.budgets(m))
+    budget = outcome.common_budget
     return f"""## {config.scene.capitalize()}, landing read at {config.landing}
 
 Run on {datetime.now(UTC).date()}: model version {MODEL_VERSION}, fidelity {config.fidelity}, reach {1e3 * outcome.reach:.0f} mm,
@@ -110,7 +115,7 @@ At the largest budget of each:
 
 {by_place(outcome)}
 
-![Share of landings within a radius of the target, after {budget} calls]({pictures}/results_{name}_profile.png)
+![Share of landings within a radius of the target, after {budget:,} calls]({pictures}/results_{name}_profile.png)
 
 ![Learning time against error]({pictures}/results_{name}_pareto.png)
 """
@@ -131,7 +136,7 @@ def write_all(outcome: Outcome, page: Path, images: Path, readme: Path | None = 
     """Figures into ``images``; the task's section into ``page`` and its table into ``readme``, between their markers."""
     ensure_folder(images)
     name = tag(outcome)
-    budget = max(b for m in outcome.methods for b in outcome.budgets(m))
+    budget = outcome.common_budget
     written = [
         figures.sample_efficiency(outcome, images / f"results_{name}_calls.png"),
         figures.profiles(outcome, budget, images / f"results_{name}_profile.png"),

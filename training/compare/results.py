@@ -29,7 +29,7 @@ def label(method: str) -> str:
     if method.startswith("best"):
         return f"the same, best of {method[4:]} simulated"
     if method.startswith("refine"):
-        return f"the same, {method[6:]} simulated in turn, each told to the next"
+        return f"the same, {method[6:]} simulated in turn"
     return LABELS.get(method, method)
 
 
@@ -82,6 +82,12 @@ class Outcome:
     def methods(self) -> list[str]:
         """Methods that were run, without the oracle."""
         return [m for m in dict.fromkeys(m for m, _ in self.scores) if m != "oracle"]
+
+    @property
+    def common_budget(self) -> int:
+        """The largest budget that every method was run at; the largest of all where there is none."""
+        every = [set(self.budgets(m)) for m in self.methods]
+        return max(set.intersection(*every) or set.union(*every))
 
     def budgets(self, method: str) -> list[int]:
         """Budgets at which a method was run."""

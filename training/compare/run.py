@@ -190,15 +190,19 @@ class Comparison:
             stretches, _ = planner.predict(self.targets)
             return {"stretches": stretches.tolist(), "calls_per_answer": planner.calls / len(self.targets)}
 
-        settings = {"evaluations": self.config.oracle, "targets": self.targets.tolist(), "budget": max(self.config.budgets)}
+        settings = {"search": asdict(self._search), "targets": self.targets.tolist(), "budget": max(self.config.budgets)}
         self.stages.run("oracle", settings, work, needs=["hops_0"])
         self._score("oracle", 0, max(self.config.budgets), "oracle", lambda: self.stages.results["oracle"])
 
     def _evolution(self) -> EvolutionPlanner:
         data = self.pool(0)
         start = NearestHopPlanner(data["stretches"][data.usable], data["landing"][data.usable])
-        population = min(16, self.config.oracle)  # as many as the simulator's lanes
-        return EvolutionPlanner(self.hops.land, start, EvolutionConfig(self.config.oracle, population, 0.04))
+        return EvolutionPlanner(self.hops.land, start, self._search)
+
+    @property
+    def _search(self) -> EvolutionConfig:
+        # the nearest stored hop is near already, and the map is rough: a wide first generation would only lose it
+        return EvolutionConfig(self.config.oracle, min(8, self.config.oracle), sigma=0.01)
 
     def _policy(self, algorithm: str, seed: int, budget: int) -> None:
         from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
