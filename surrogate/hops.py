@@ -220,7 +220,6 @@ def from_result(
 ) -> HopData:
     """Columns of a simulated batch; ``index`` numbers its hops (default: from 0), ``cpu_seconds`` is for all of them."""
     found = result.equilibria
-    assert found is not None, "simulate starts from equilibria"
     columns = {name: getattr(result, name) for name in COLUMNS if hasattr(result, name)}
     if configuration.trajectory != "none" and result.trajectory is not None:
         track = result.trajectory

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from tensegrity_gym import reachable
+from tensegrity_gym import calibration, reachable
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, OutputFolderError, TensegrityError
 from tensegrity_gym.hops import HopResult
@@ -105,6 +105,27 @@ def reach(scene: str = "earth", hops: int = 256, seed: int = 0, save: bool = Fal
         print(f"saved: {reachable.save_reach(scene, measured, hops, seed)}")
 
 
+def calibrate(scene: str = "earth", samples: int = 64, seed: int = 1, save: bool = False) -> None:
+    """Measure what each model of the ladder costs and how far from the converged landing it ends.
+
+    Args:
+        scene: name of a scene preset.
+        samples: hops to measure on.
+        seed: of the Sobol sequence that their stretches are from.
+        save: replace the calibration that the package stores for this preset, which `fidelity="auto"` chooses by.
+    """
+    batches = 2 + calibration.UNKNOWNS + sum(len(models) for models in calibration.LADDER.values())
+    with tqdm(total=batches, desc=f"models, {scene}", unit="batch") as bar:
+        measured = calibration.calibrate(Scene.preset(scene), samples, seed, progress=bar.update)
+    for landing, found in measured.items():
+        print(f"{scene}, {landing}: floor {1e3 * found.floor:.3g} mm")
+        print("  cost   median [mm]  97 % [mm]  model")
+        for rung in found.rungs:
+            print(f"  {rung.cost:.3f}  {1e3 * rung.median:11.3g}  {1e3 * rung.error:9.3g}  {rung.fidelity}")
+    if save:
+        print(f"saved: {calibration.save_calibration(scene, measured, seed)}")
+
+
 def summary(result: HopResult, scene: Scene) -> str:
     """The first hop of ``result``, readable."""
     status = HopStatus(int(result.status[0]))
@@ -142,7 +163,10 @@ def main(args: list[str] | None = None) -> int:
     """Run the command; errors of this project's own are printed as one line, with exit status 2."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"hop": hop, "info": info, "reach": reach}, prog="python -m tensegrity_gym", description=__doc__, args=args
+            {"hop": hop, "info": info, "reach": reach, "calibrate": calibrate},
+            prog="python -m tensegrity_gym",
+            description=__doc__,
+            args=args,
         )
     except TensegrityError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)

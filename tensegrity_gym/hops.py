@@ -59,7 +59,7 @@ class HopResult:
     energies: Floats  #: at release, take-off, touchdown, end [J], columns ENERGY_NAMES, shape (n, 4, 7)
     stored_energy: Floats  #: elastic energy at release, in the locked lattice [J], shape (n,)
     start_positions: Floats = field(repr=False)  #: [m], shape (n, n_masses, 3)
-    equilibria: Equilibria | None  #: what the hops started from; None for drops
+    equilibria: Equilibria  #: what the hops started from; None for drops
     structure: Structure = field(repr=False)  #: the lattice as it was simulated
     fidelity: Fidelity  #: how it was simulated and why so; ``str`` of it is one line
     dt: float  #: time step [s]
@@ -134,12 +134,45 @@ def run(
         landing=columns[scene.landing].copy(),
         stored_energy=stored_energy,
         start_positions=starts[:, 0] if equilibria is None else equilibria.positions,
-        equilibria=equilibria,
+        equilibria=equilibria,  # type: ignore[arg-type]
         structure=problem.structure,
         fidelity=fidelity,
         dt=dt,
         trajectory=frames if rate else None,
         **columns,  # type: ignore[arg-type]
+    )
+
+
+def hop(
+    equilibria: Equilibria,
+    *,
+    design: Design,
+    scene: Scene,
+    lattice: Lattice,
+    fidelity: Fidelity,
+    dt: float | None = None,
+    allow_unstable: bool = False,
+    rate: float = 0.0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> HopResult:
+    """Hops from ``equilibria`` of ``fidelity.design(design)``; the rest as for :func:`tensegrity_gym.simulate`."""
+    modelled = fidelity.design(design)
+    step = time_step(dt, modelled, lattice, fidelity, allow_unstable)
+    return run(
+        np.stack([equilibria.positions, np.zeros_like(equilibria.positions)], axis=1),
+        equilibria.converged,
+        equilibria.stored_energy,
+        equilibria.stretches,
+        design=modelled,
+        scene=scene,
+        lattice=lattice,
+        fidelity=fidelity,
+        dt=step,
+        rate=rate,
+        threads=threads,
+        progress=progress,
+        equilibria=equilibria,
     )
 
 

@@ -12,7 +12,7 @@ from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.fidelity import Fidelity, changed, named_fidelity
 from tensegrity_gym.formfinding import Equilibria, form_find
-from tensegrity_gym.hops import HopResult, positive, run, time_step
+from tensegrity_gym.hops import HopResult, hop, positive, run, time_step
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
 
@@ -60,25 +60,22 @@ def simulate(
         chosen = named_fidelity(fidelity)
     chosen = changed(chosen, {"integrator": integrator, "precision": precision})
     modelled = chosen.design(design)
-    step = time_step(dt, modelled, lattice, chosen, allow_unstable)
     if equilibria is None:
+        time_step(dt, modelled, lattice, chosen, allow_unstable)  # refused before the search, not after it
         equilibria = form_find(stretches, design=modelled, scene=scene, lattice=lattice, threads=threads)
     else:
         _check_equilibria(equilibria, stretches, lattice.mass_count(int(modelled.bar_segments)))
-    return run(
-        np.stack([equilibria.positions, np.zeros_like(equilibria.positions)], axis=1),
-        equilibria.converged,
-        equilibria.stored_energy,
-        equilibria.stretches,
-        design=modelled,
+    return hop(
+        equilibria,
+        design=design,
         scene=scene,
         lattice=lattice,
         fidelity=chosen,
-        dt=step,
+        dt=dt,
+        allow_unstable=allow_unstable,
         rate=rate,
         threads=threads,
         progress=progress,
-        equilibria=equilibria,
     )
 
 
