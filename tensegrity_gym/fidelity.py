@@ -109,4 +109,7 @@ def changed(fidelity: Fidelity, levers: dict[str, Any]) -> Fidelity:
     unknown = sorted(set(given) - {f.name for f in fields(Fidelity)})
     if unknown:
         raise InvalidParameterError(f"fidelity: expected levers out of {[f.name for f in fields(Fidelity)]}, got {unknown}")
-    return replace(fidelity, **given) if given else fidelity
+    if not given:
+        return fidelity
+    reason = f"{fidelity.reason}; then by hand: {', '.join(sorted(given))}" if fidelity.reason else ""
+    return replace(fidelity, reason=reason, **given)
