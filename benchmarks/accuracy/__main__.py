@@ -6,10 +6,24 @@ from dataclasses import dataclass
 
 import tyro
 
-from benchmarks.accuracy import bars, damping, drops, floor, growth, limits, reference, rounding, scenes, sensitivity, stability
+from benchmarks.accuracy import (
+    auto,
+    bars,
+    damping,
+    drops,
+    floor,
+    growth,
+    ladder,
+    limits,
+    reference,
+    rounding,
+    scenes,
+    sensitivity,
+    stability,
+)
 from benchmarks.accuracy.part import Options
 
-MODULES = (bars, reference, floor, sensitivity, growth, stability, limits, drops, rounding, damping, scenes)
+MODULES = (bars, reference, floor, sensitivity, growth, stability, limits, drops, rounding, damping, scenes, ladder, auto)
 PARTS = {module.PART.name: module.PART for module in MODULES}
 
 
