@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tensegrity_gym.core import rollout as kernel
+from tensegrity_gym.core import records as rec
 from tensegrity_gym.energies import centre_of_mass
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.rollouts import Problem
@@ -16,11 +16,11 @@ def flew(status: np.ndarray) -> np.ndarray:
     return np.isin(status, (HopStatus.RESTED, HopStatus.TIME_LIMIT, HopStatus.STOPPED))
 
 
-def measure(records: kernel.HopRecords, problem: Problem, lattice: Lattice) -> dict[str, np.ndarray]:
+def measure(records: rec.HopRecords, problem: Problem, lattice: Lattice) -> dict[str, np.ndarray]:
     """Columns of HopResult and, under "frame_...", of Trajectory."""
     centre = centre_of_mass(problem.structure, records.state)  # (n, 4, 2, 3)
     nodes = records.state[:, :, :, : lattice.n_nodes].mean(axis=3)
-    start, takeoff, touchdown, end = kernel.RELEASE, kernel.TAKEOFF, kernel.TOUCHDOWN, kernel.END
+    start, takeoff, touchdown, end = rec.RELEASE, rec.TAKEOFF, rec.TOUCHDOWN, rec.END
     took_off = flew(records.status)
     followed = records.status != HopStatus.STOPPED
 
@@ -63,7 +63,7 @@ def measure(records: kernel.HopRecords, problem: Problem, lattice: Lattice) -> d
     }
 
 
-def event_energies(records: kernel.HopRecords, problem: Problem) -> Floats:
+def event_energies(records: rec.HopRecords, problem: Problem) -> Floats:
     """Energies at the four events [J], columns ENERGY_NAMES, shape (n, 4, 7)."""
     energies = np.zeros((len(records.status), 4, len(ENERGY_NAMES)))
     for event in range(4):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tensegrity_gym.batch import Progress, run_shares
+from tensegrity_gym.core import records as rec
 from tensegrity_gym.core import rollout as kernel
 from tensegrity_gym.core.flight import fly_rigidly
 from tensegrity_gym.core.lanes import lane_count, lanes_empty
@@ -78,10 +79,10 @@ class Problem:
         """Steps of the scene's duration, in whole strides."""
         return int(np.ceil(self.scene.duration / self.dt / STRIDE)) * STRIDE
 
-    def settings(self, stop: int) -> kernel.HopSettings:
+    def settings(self, stop: int) -> rec.HopSettings:
         """How the kernel steps, watches and ends hops that are followed as far as ``stop``."""
         gravity, height = self.scene.gravity, self.cell_height
-        return kernel.HopSettings(
+        return rec.HopSettings(
             dt=self.dt,
             lag=INTEGRATORS[self.fidelity.integrator][1],
             stride=STRIDE,
@@ -122,7 +123,7 @@ def follow(
     runaway: Floats,
     threads: int | None,
     progress: Progress | None,
-) -> kernel.HopRecords:
+) -> rec.HopRecords:
     """Follow hops from ``starts``, shape (n, 2, n_masses, 3) [m, m/s], as far and as finely as the fidelity says.
 
     ``phase`` is the kernel's STANDING or FLYING; hops that are not ``usable`` are not simulated; ``runaway`` is a kinetic
@@ -130,26 +131,26 @@ def follow(
     """
     fidelity = problem.fidelity
     to_rest = fidelity.stop == "rest" or problem.scene.landing == "rest"
-    last = kernel.END if to_rest else kernel.TOUCHDOWN
+    last = rec.END if to_rest else rec.TOUCHDOWN
     records = _records(problem, starts, phase, usable, runaway)
     if fidelity.flight == "full":
         _roll_out(problem, last, records, threads, progress)
         return records
-    _roll_out(problem, kernel.TAKEOFF, records, threads, None if to_rest else progress)
+    _roll_out(problem, rec.TAKEOFF, records, threads, None if to_rest else progress)
     _fly(problem, records)
     if to_rest:
         _go_on(problem, records, runaway, threads, progress)
     return records
 
 
-def _records(problem: Problem, starts: Floats, phase: int, usable: np.ndarray, runaway: Floats) -> kernel.HopRecords:
+def _records(problem: Problem, starts: Floats, phase: int, usable: np.ndarray, runaway: Floats) -> rec.HopRecords:
     n, m = starts.shape[0], starts.shape[2]
     frames = problem.max_steps // problem.frame_stride if problem.frame_stride else 0
     state = np.zeros((n, 4, 2, m, 3))
-    state[:, kernel.RELEASE] = starts
-    if phase != kernel.STANDING:
-        state[:, kernel.TAKEOFF] = starts
-    return kernel.HopRecords(
+    state[:, rec.RELEASE] = starts
+    if phase != rec.STANDING:
+        state[:, rec.TAKEOFF] = starts
+    return rec.HopRecords(
         phase=np.full(n, phase, dtype=np.int64),
         max_steps=np.full(n, problem.max_steps, dtype=np.int64),
         state=state,
@@ -171,11 +172,11 @@ def _records(problem: Problem, starts: Floats, phase: int, usable: np.ndarray, r
     )
 
 
-def hop_lanes(structure: Structure) -> kernel.LaneState:
+def hop_lanes(structure: Structure) -> rec.LaneState:
     """Work arrays of one thread."""
     dtype = structure.mass.dtype
     count, n = lane_count(dtype), len(structure.mass)
-    return kernel.LaneState(
+    return rec.LaneState(
         x=lanes_empty((n, 3), dtype),
         v=lanes_empty((n, 3), dtype),
         f=lanes_empty((n, 3), dtype),
@@ -185,7 +186,7 @@ def hop_lanes(structure: Structure) -> kernel.LaneState:
         one=np.zeros((3, n, 3), dtype),
         one_memory=np.zeros(structure.n_axial_members, dtype),
         actuator_length=lanes_empty((len(structure.actuators),), dtype),
-        scalars=lanes_empty((kernel.N_SCALARS,), dtype),
+        scalars=lanes_empty((rec.N_SCALARS,), dtype),
         hop=np.zeros(count, dtype=np.int64),
         step=np.zeros(count, dtype=np.int64),
         quiet=np.zeros(count, dtype=np.int64),
@@ -193,7 +194,7 @@ def hop_lanes(structure: Structure) -> kernel.LaneState:
     )
 
 
-def _roll_out(problem: Problem, stop: int, records: kernel.HopRecords, threads: int | None, progress: Progress | None) -> None:
+def _roll_out(problem: Problem, stop: int, records: rec.HopRecords, threads: int | None, progress: Progress | None) -> None:
     dtype = np.dtype(problem.fidelity.precision)
     typed = problem.structure.astype(dtype)
     ground = problem.ground._replace(gravity=problem.ground.gravity.astype(dtype))
@@ -205,19 +206,19 @@ def _roll_out(problem: Problem, stop: int, records: kernel.HopRecords, threads: 
     run_shares(work, len(records.status), threads, lane_count(dtype), progress)
 
 
-def _fly(problem: Problem, records: kernel.HopRecords) -> None:
+def _fly(problem: Problem, records: rec.HopRecords) -> None:
     """Take every hop that stopped in the air to its touchdown, which becomes its end for now.
 
     The energy of the vibration that is frozen counts as dissipated by damping.
     """
     limit = problem.max_steps * problem.dt
-    aloft = np.flatnonzero((records.status == HopStatus.STOPPED) & (records.phase == kernel.FLYING))
+    aloft = np.flatnonzero((records.status == HopStatus.STOPPED) & (records.phase == rec.FLYING))
     if not len(aloft):
         return
-    before = problem.total_energy(records.state[aloft, kernel.END])
+    before = problem.total_energy(records.state[aloft, rec.END])
     seen = records.frame_count[aloft].copy()
     for hop in aloft:
-        start = records.time[hop, kernel.END]
+        start = records.time[hop, rec.END]
         done, room = int(records.frame_count[hop]), records.frame_times.shape[1]
         times = problem.frame_stride * problem.dt * np.arange(done + 1, room + 1) - problem.trail - start
         frames = np.zeros((len(times), 2, *problem.shape.shape))
@@ -226,27 +227,27 @@ def _fly(problem: Problem, records: kernel.HopRecords) -> None:
             problem.shape,
             problem.ground.gravity,
             min(problem.ground.masses, len(problem.shape)),
-            records.state[hop, kernel.END],
+            records.state[hop, rec.END],
             max(limit - start, 0.0),
             times,
             frames,
         )
-        records.time[hop, kernel.END] = start + flown
+        records.time[hop, rec.END] = start + flown
         _add_frames(problem, records, hop, start + times[:count], frames[:count])
         if landed:
-            records.phase[hop] = kernel.LANDED
+            records.phase[hop] = rec.LANDED
         else:
             records.status[hop] = HopStatus.TIME_LIMIT
-    frozen = before - problem.total_energy(records.state[aloft, kernel.END])
-    records.dissipated[aloft, kernel.END, 1] += frozen
+    frozen = before - problem.total_energy(records.state[aloft, rec.END])
+    records.dissipated[aloft, rec.END, 1] += frozen
     for hop, first, energy in zip(aloft, seen, frozen, strict=True):
         records.frame_energies[hop, first : records.frame_count[hop], 6] += energy
     for name in ("state", "time", "dissipated"):
-        getattr(records, name)[aloft, kernel.TOUCHDOWN] = getattr(records, name)[aloft, kernel.END]
+        getattr(records, name)[aloft, rec.TOUCHDOWN] = getattr(records, name)[aloft, rec.END]
     records.shift[aloft, 1] = 0.0
 
 
-def _add_frames(problem: Problem, records: kernel.HopRecords, hop: np.integer, times: Floats, states: Floats) -> None:
+def _add_frames(problem: Problem, records: rec.HopRecords, hop: np.integer, times: Floats, states: Floats) -> None:
     """Append frames of a rigid flight, states (k, 2, n_masses, 3); what was dissipated is what it was at its start."""
     if not len(times):
         return
@@ -255,20 +256,20 @@ def _add_frames(problem: Problem, records: kernel.HopRecords, hop: np.integer, t
     records.frame_positions[hop, frames] = states[:, 0]
     for name, values in problem.energies(states[:, 0], states[:, 1]).items():
         records.frame_energies[hop, frames, ENERGY_NAMES.index(name)] = values
-    records.frame_energies[hop, frames, 5:] = records.dissipated[hop, kernel.END]
+    records.frame_energies[hop, frames, 5:] = records.dissipated[hop, rec.END]
     records.frame_count[hop] = frames.stop
 
 
-def _go_on(problem: Problem, records: kernel.HopRecords, runaway: Floats, threads: int | None, progress: Progress | None) -> None:
+def _go_on(problem: Problem, records: rec.HopRecords, runaway: Floats, threads: int | None, progress: Progress | None) -> None:
     """Follow the hops that stopped after touchdown to their rest."""
-    landed = (records.status == HopStatus.STOPPED) & (records.phase == kernel.LANDED)
-    rest = _records(problem, records.state[:, kernel.END], kernel.LANDED, landed, runaway)
-    offset, dissipated = records.time[:, kernel.END].copy(), records.dissipated[:, kernel.END].copy()
+    landed = (records.status == HopStatus.STOPPED) & (records.phase == rec.LANDED)
+    rest = _records(problem, records.state[:, rec.END], rec.LANDED, landed, runaway)
+    offset, dissipated = records.time[:, rec.END].copy(), records.dissipated[:, rec.END].copy()
     rest.max_steps[:] = np.maximum(STRIDE, (problem.max_steps - offset / problem.dt) // STRIDE * STRIDE)
-    _roll_out(problem, kernel.END, rest, threads, progress)
-    records.state[landed, kernel.END] = rest.state[landed, kernel.END]
-    records.time[landed, kernel.END] = (offset + rest.time[:, kernel.END])[landed]
-    records.dissipated[landed, kernel.END] += rest.dissipated[landed, kernel.END]
+    _roll_out(problem, rec.END, rest, threads, progress)
+    records.state[landed, rec.END] = rest.state[landed, rec.END]
+    records.time[landed, rec.END] = (offset + rest.time[:, rec.END])[landed]
+    records.dissipated[landed, rec.END] += rest.dissipated[landed, rec.END]
     records.impacts[landed] = (offset[:, None] + rest.impacts)[landed]
     for name in ("impact_count", "status", "failed_mass", "failed_member"):
         getattr(records, name)[landed] = getattr(rest, name)[landed]
@@ -282,4 +283,4 @@ def _go_on(problem: Problem, records: kernel.HopRecords, runaway: Floats, thread
         records.frame_energies[hop, done : done + count, 5:] += dissipated[hop]
         records.frame_count[hop] = done + count
     failed = landed & (rest.status == HopStatus.UNSTABLE)
-    records.state[failed, kernel.END] = records.state[failed, kernel.RELEASE]  # a finite number that its status disowns
+    records.state[failed, rec.END] = records.state[failed, rec.RELEASE]  # a finite number that its status disowns

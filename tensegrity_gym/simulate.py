@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from tensegrity_gym.auto import choose_fidelity
 from tensegrity_gym.batch import Progress
-from tensegrity_gym.core import rollout as kernel
+from tensegrity_gym.core import records as rec
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.fidelity import Fidelity, changed, named_fidelity
@@ -133,7 +133,7 @@ def drop(
         np.ones(n, dtype=bool),
         np.zeros(n),
         np.ones((n, lattice.n_cells)),
-        phase=kernel.FLYING,
+        phase=rec.FLYING,
         design=modelled,
         scene=scene,
         lattice=lattice,
