@@ -29,7 +29,7 @@ __all__ = ["OUTPUTS", "HopNet", "NetConfig", "Output", "Prediction", "load", "sa
 
 FORMAT = "tensegrity_gym.surrogate/2"
 #: Factor on the usual initial weights of the first layer: landings vary within a small part of the range of stretches, which a
-#: net with the usual ones is slow to learn (8 % less error after the same time at 10 000 hops).
+#: net with the usual ones is slow to learn.
 FIRST_GAIN = 3.0
 #: Bounds of the natural logarithm of a variance, in units of the output's spread: from 1e-3 of it to three of it.
 LOG_VARIANCE = (-14.0, 2.2)
