@@ -11,22 +11,20 @@ import numpy as np
 
 from tensegrity_gym.batch import Progress, run_shares
 from tensegrity_gym.core.conjugate_gradient import DescentSettings
-from tensegrity_gym.core.descent import DescentRecords, DescentScratch, GroundSettings, descend_equilibria, relax_equilibria
-from tensegrity_gym.core.lanes import lane_count, lanes_empty
-from tensegrity_gym.core.newton import N_SCALARS, EquilibriumRecords, NewtonLanes, NewtonSettings, newton_equilibria
+from tensegrity_gym.core.descent import DescentCases, DescentRecords, GroundSettings, Loads, descend_equilibria, relax_equilibria
+from tensegrity_gym.core.newton import EquilibriumRecords, NewtonSettings, newton_equilibria
 from tensegrity_gym.core.relaxation import RelaxationSettings
 from tensegrity_gym.design import Design
 from tensegrity_gym.elimination import lattice_pattern
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.types import Floats, Structure
+from tensegrity_gym.workspaces import descent_lanes, ground_lanes, lanes_for, newton_lanes, relaxation_lanes, without_lanes
 
 #: The load that decides which way a bar bows, over the bar's Euler load: downwards, as a bar's own weight does on Earth.
 IMPERFECTION = 1e-5
 #: Residual force per mass at which Newton's equilibria count as found, over the Euler load of a bar.
 TOLERANCE = 1e-8
-#: Up to so many equilibria Newton solves one after another, without lanes: eight at once cost as much as some alone.
-ALONE = 2
 #: Load paths, each with half the step of the one before, that Newton tries.
 TRIES = 3
 #: Fictitious masses of relaxation over the sum of the stiffnesses at them; 1/2 is the limit of linear stability.
@@ -199,7 +197,7 @@ def newton_run(problem: Problem, settings: NewtonSettings, threads: int | None, 
         converged=np.zeros(n, dtype=np.bool_),
         least_pivot=np.zeros(n),
     )
-    count = 1 if n <= ALONE else lane_count(np.float64)
+    count = lanes_for(n)
 
     def work(first: int, last: int, counter: np.ndarray) -> None:
         lanes = newton_lanes(m, structure.n_axial_members, structure.actuator_length, pattern.n_slots, count)
@@ -212,57 +210,9 @@ def newton_run(problem: Problem, settings: NewtonSettings, threads: int | None, 
     return records
 
 
-def newton_lanes(n_masses: int, members: int, unloaded_length: Floats, n_slots: int, count: int) -> NewtonLanes:
-    """Work arrays of one thread for ``count`` lattices at a time: as many as a vector has lanes, or one."""
-    actuators = len(unloaded_length)
-
-    def empty(*shape: int) -> np.ndarray:
-        return lanes_empty(shape) if count == lane_count(np.float64) else np.zeros((*shape, count))
-
-    return NewtonLanes(
-        x=empty(n_masses, 3),
-        anchor=empty(n_masses, 3),
-        still=empty(n_masses, 3),
-        f=empty(n_masses, 3),
-        memory=empty(members),
-        d=empty(n_masses, 3),
-        h=empty(n_slots, 9),
-        actuator_length=empty(actuators),
-        unloaded_length=unloaded_length,
-        scalars=empty(N_SCALARS),
-        case=np.zeros(count, dtype=np.int64),
-        iterations=np.zeros(count, dtype=np.int64),
-        share=np.zeros(count),
-        rounds=np.zeros(count, dtype=np.int64),
-        tension=empty(members),
-        anchor_tension=empty(members),
-        strayed=np.zeros(count, dtype=np.int64),
-        held=empty(n_masses),
-    )
-
-
-def without_lanes(lanes: NewtonLanes) -> NewtonLanes:
-    """The work arrays of a single lane, seen without their lane axis."""
-    of_lattice = (
-        "x",
-        "anchor",
-        "still",
-        "f",
-        "memory",
-        "d",
-        "h",
-        "actuator_length",
-        "scalars",
-        "tension",
-        "anchor_tension",
-        "held",
-    )
-    return lanes._replace(**{name: getattr(lanes, name).reshape(getattr(lanes, name).shape[:-1]) for name in of_lattice})
-
-
 def cg_search(problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None) -> Found:
-    """The paper's conjugate gradients from the unloaded lattice, one lattice after another in each thread."""
-    structure, design = problem.structure, problem.design
+    """The paper's conjugate gradients from the unloaded lattice."""
+    design, n = problem.design, len(problem.stretches)
     settings = DescentSettings(
         tolerance=(options.tolerance or 1e-5) * design.critical_load,
         max_iterations=options.max_iterations or 200_000,
@@ -271,28 +221,29 @@ def cg_search(problem: Problem, options: SearchOptions, threads: int | None, pro
         longest_step=0.05 * design.cell_height,
         sufficient=0.1,
     )
-    ground, dead_load, gravity = _ground(problem), imperfection_forces(design, structure), problem.normal_gravity
-    records = _descent_records(problem)
+    cases = DescentCases(problem.stretches, np.zeros((n, 0)))
+    loads, ground = _loads(problem), _ground(problem, settings.tolerance)
+    records, count = _descent_records(problem), lanes_for(n)
 
     def work(first: int, last: int, counter: np.ndarray) -> None:
-        scratch = descent_scratch(structure)
-        descend_equilibria(
-            structure, gravity, dead_load, ground, settings, problem.stretches, records, scratch, first, last, counter
-        )
+        own = ground_lanes(problem.structure, cases, count, first, last)
+        lanes = descent_lanes(own.x)
+        own_work, lanes_work = (own, lanes) if count > 1 else (without_lanes(own), without_lanes(lanes))
+        descend_equilibria(loads, ground, settings, cases, records, own, own_work, lanes, lanes_work, counter)
 
-    run_shares(work, len(problem.stretches), threads, 1, progress)
+    run_shares(work, n, threads, count, progress)
     return Found(*records, settings.tolerance, settings.max_iterations)
 
 
 def relaxation_search(
     problem: Problem, options: SearchOptions, threads: int | None, progress: Progress | None, mass: Floats | None = None
 ) -> Found:
-    """Dynamic relaxation from the unloaded lattice, one lattice after another in each thread.
+    """Dynamic relaxation from the unloaded lattice.
 
     ``mass`` (n, n_masses) [N step^2/m] replaces the :func:`fictitious_masses`; real ones over the square of a time step relax as
     a simulation does.
     """
-    structure, design = problem.structure, problem.design
+    structure, design, n = problem.structure, problem.design, len(problem.stretches)
     settings = RelaxationSettings(
         tolerance=(options.tolerance or 2e-6) * design.critical_load,
         max_iterations=options.max_iterations or 2_000_000,
@@ -300,17 +251,18 @@ def relaxation_search(
         softest=1e-4,
         longest_step=0.05 * design.cell_height,
     )
-    ground, dead_load, gravity = _ground(problem), imperfection_forces(design, structure), problem.normal_gravity
-    mass = fictitious_masses(structure, problem.stretches, ground.soft_ground) if mass is None else mass
-    records = _descent_records(problem)
+    mass = fictitious_masses(structure, problem.stretches, problem.soft_ground) if mass is None else mass
+    cases = DescentCases(problem.stretches, mass)
+    loads, ground = _loads(problem), _ground(problem, settings.tolerance)
+    records, count = _descent_records(problem), lanes_for(n)
 
     def work(first: int, last: int, counter: np.ndarray) -> None:
-        scratch = descent_scratch(structure)
-        relax_equilibria(
-            structure, gravity, dead_load, ground, settings, problem.stretches, mass, records, scratch, first, last, counter
-        )
+        own = ground_lanes(structure, cases, count, first, last)
+        lanes = relaxation_lanes(own.x, own.mass)
+        own_work, lanes_work = (own, lanes) if count > 1 else (without_lanes(own), without_lanes(lanes))
+        relax_equilibria(loads, ground, settings, cases, records, own, own_work, lanes, lanes_work, counter)
 
-    run_shares(work, len(problem.stretches), threads, 1, progress)
+    run_shares(work, n, threads, count, progress)
     return Found(*records, settings.tolerance, settings.max_iterations)
 
 
@@ -336,23 +288,13 @@ def fictitious_masses(structure: Structure, stretches: Floats, soft_ground: floa
     return np.ascontiguousarray(mass.T)
 
 
-def descent_scratch(structure: Structure) -> DescentScratch:
-    """Work arrays of one thread."""
-    shape = (len(structure.mass), 3)
-    return DescentScratch(
-        f=np.zeros(shape),
-        old=np.zeros(shape),
-        d=np.zeros(shape),
-        trial=np.zeros(shape),
-        still=np.zeros(shape),
-        memory=np.zeros(structure.n_axial_members),
-        held=np.zeros(shape[0]),
-        actuator_length=np.zeros(len(structure.actuators)),
-    )
+def _loads(problem: Problem) -> Loads:
+    return Loads(problem.structure, problem.normal_gravity, imperfection_forces(problem.design, problem.structure))
 
 
-def _ground(problem: Problem) -> GroundSettings:
-    return GroundSettings(soft_ground=problem.soft_ground, release=1e-6 * problem.design.critical_load, max_rounds=100)
+def _ground(problem: Problem, tolerance: float) -> GroundSettings:
+    release = 1e-6 * problem.design.critical_load
+    return GroundSettings(soft_ground=problem.soft_ground, release=release, max_rounds=100, tolerance=tolerance)
 
 
 def _descent_records(problem: Problem) -> DescentRecords:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,13 +12,15 @@ from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
 from tensegrity_gym import Design, Equilibria, InvalidParameterError, InvalidStretchesError, Lattice, Scene, form_find
-from tensegrity_gym.core.conjugate_gradient import DescentSettings, DescentWork, conjugate_gradient, parabola_minimum
+from tensegrity_gym.core.conjugate_gradient import DescentSettings, conjugate_gradient, parabola_minimum
 from tensegrity_gym.core.jit import jit
+from tensegrity_gym.core.lanes import load, select, splat, sqrt, store
 from tensegrity_gym.core.newton import EquilibriumRecords, NewtonSettings, newton_equilibria
-from tensegrity_gym.core.relaxation import RelaxationSettings, RelaxationWork, relax
+from tensegrity_gym.core.relaxation import RelaxationSettings, relax
 from tensegrity_gym.elimination import block_pattern
-from tensegrity_gym.searches import SearchOptions, fictitious_masses, newton_lanes
+from tensegrity_gym.searches import SearchOptions, fictitious_masses
 from tensegrity_gym.types import Structure
+from tensegrity_gym.workspaces import descent_lanes, lane_array, newton_lanes, relaxation_lanes, without_lanes
 
 CELL = Lattice(1, 1)
 DESIGN = Design()
@@ -25,63 +29,131 @@ DESIGN = Design()
 @jit
 def rosenbrock(problem, x):
     """(1 - a)^2 + 100 (b - a^2)^2 of x = [[a, b]]."""
-    a, b = x[0, 0], x[0, 1]
-    return (1.0 - a) ** 2 + 100.0 * (b - a * a) ** 2
+    a, b = load(x, 0, 0), load(x, 0, 1)
+    return (1.0 - a) * (1.0 - a) + 100.0 * (b - a * a) * (b - a * a)
 
 
 @jit
 def rosenbrock_forces(problem, x, f):
     """Minus its gradient; returns the norm."""
-    a, b = x[0, 0], x[0, 1]
-    f[0, 0] = 2.0 * (1.0 - a) + 400.0 * a * (b - a * a)
-    f[0, 1] = -200.0 * (b - a * a)
-    return np.sqrt(f[0, 0] ** 2 + f[0, 1] ** 2)
+    a, b = load(x, 0, 0), load(x, 0, 1)
+    along, across = 2.0 * (1.0 - a) + 400.0 * a * (b - a * a), -200.0 * (b - a * a)
+    store(f, 0, 0, along)
+    store(f, 0, 1, across)
+    return sqrt(along * along + across * across)
 
 
 @jit
 def quadratic(problem, x):
     """x . K x / 2 - b . x with problem = (K, b)."""
-    total = 0.0
+    total = load(x, 0, 0) * 0.0
     for i in range(x.shape[0]):
-        row = 0.0
+        row = total * 0.0
         for j in range(x.shape[0]):
-            row += problem[0][i, j] * x[j, 0]
-        total += x[i, 0] * (0.5 * row - problem[1][i])
+            row = row + problem[0][i, j] * load(x, j, 0)
+        total = total + load(x, i, 0) * (0.5 * row - problem[1][i])
     return total
 
 
 @jit
 def quadratic_forces(problem, x, f):
     """b - K x; returns the largest entry."""
-    worst = 0.0
+    worst = load(x, 0, 0) * 0.0
     for i in range(x.shape[0]):
-        f[i, 0] = problem[1][i]
+        force = splat(problem[1][i], worst)
         for j in range(x.shape[0]):
-            f[i, 0] -= problem[0][i, j] * x[j, 0]
-        worst = max(worst, abs(f[i, 0]))
+            force = force - problem[0][i, j] * load(x, j, 0)
+        store(f, i, 0, force)
+        size = select(force < 0.0, -force, force)
+        worst = select(size > worst, size, worst)
     return worst
 
 
+class Starts(NamedTuple):
+    """Where searches start and what they end with, in the order of the starts."""
+
+    x: np.ndarray  #: shape (n, ...)
+    lanes_x: np.ndarray  #: of the searches, shape (..., lanes)
+    case: np.ndarray  #: which start each lane has, shape (lanes,)
+    next: np.ndarray  #: start not yet taken, shape (1,)
+    residual: np.ndarray  #: shape (n,)
+    iterations: np.ndarray  #: shape (n,)
+    evaluations: np.ndarray  #: shape (n,)
+
+
+@jit
+def copy_rows(source, target):
+    """target = source, shape (n, k) each."""
+    for i in range(source.shape[0]):
+        for c in range(source.shape[1]):
+            target[i, c] = source[i, c]
+
+
+@jit(forceinline=False)
+def next_start(problem, starts, lane, residual, iterations, evaluations):
+    """Note what a lane's search ended with, and load the next start."""
+    case = starts.case[lane]
+    if case >= 0:
+        copy_rows(starts.lanes_x[:, :, lane], starts.x[case])
+        starts.residual[case] = residual
+        starts.iterations[case] = iterations
+        starts.evaluations[case] = evaluations
+    starts.case[lane] = starts.next[0]
+    if starts.next[0] == len(starts.x):
+        starts.case[lane] = -1
+        return False
+    copy_rows(starts.x[starts.next[0]], starts.lanes_x[:, :, lane])
+    starts.next[0] += 1
+    return True
+
+
 @jit(cache=False, forceinline=False, _nrt=True)
-def run_rosenbrock(x, work, settings):
+def run_rosenbrock(starts, settings, lanes, work):
     """Conjugate gradients on Rosenbrock's valley."""
-    return conjugate_gradient(rosenbrock, rosenbrock_forces, 0.0, x, work, settings)
+    conjugate_gradient(rosenbrock, rosenbrock_forces, next_start, 0.0, starts, settings, lanes, work)
 
 
 @jit(cache=False, forceinline=False, _nrt=True)
-def run_quadratic(problem, x, work, settings):
+def run_quadratic(problem, starts, settings, lanes, work):
     """Conjugate gradients on a quadratic."""
-    return conjugate_gradient(quadratic, quadratic_forces, problem, x, work, settings)
+    conjugate_gradient(quadratic, quadratic_forces, next_start, problem, starts, settings, lanes, work)
 
 
 @jit(cache=False, forceinline=False, _nrt=True)
-def run_relaxation(problem, mass, x, work, settings):
+def run_relaxation(problem, starts, settings, lanes, work):
     """Relaxation of a quadratic."""
-    return relax(quadratic_forces, problem, mass, x, work, settings)
+    relax(quadratic_forces, next_start, problem, starts, settings, lanes, work)
 
 
-def scratch(shape: tuple[int, int]) -> DescentWork:
-    return DescentWork(*(np.zeros(shape) for _ in range(4)))
+def queue_of(x: np.ndarray, lanes_x: np.ndarray) -> Starts:
+    n, count = len(x), lanes_x.shape[-1]
+    case, first = np.full(count, -1), np.zeros(1, np.int64)
+    return Starts(x.copy(), lanes_x, case, first, np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64))
+
+
+def by_gradients(run: Callable[..., None], x: np.ndarray, settings: DescentSettings, count: int = 1) -> Starts:
+    """Conjugate gradients from ``x``, (n, m, k), in ``count`` lanes (8), or without (1)."""
+    lanes = descent_lanes(lane_array(count, *x.shape[1:]))
+    starts = queue_of(x, lanes.x)
+    run(starts, settings, lanes, lanes if count > 1 else without_lanes(lanes))
+    return starts
+
+
+def by_relaxation(
+    problem: tuple[np.ndarray, np.ndarray], x: np.ndarray, mass: float, settings: RelaxationSettings, count: int = 1
+) -> Starts:
+    """Relaxation of a quadratic from ``x``, (n, m, 1), in ``count`` lanes (8), or without (1)."""
+    masses = lane_array(count, x.shape[1])
+    masses[:] = mass
+    lanes = relaxation_lanes(lane_array(count, *x.shape[1:]), masses)
+    starts = queue_of(x, lanes.x)
+    run_relaxation(problem, starts, settings, lanes, lanes if count > 1 else without_lanes(lanes))
+    return starts
+
+
+def same_searches(one: Starts, other: Starts) -> None:
+    for name in ("x", "residual", "iterations", "evaluations"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
 def descent(**changes: float) -> DescentSettings:
@@ -102,47 +174,64 @@ def test_parabola_minimum_is_exact_on_a_parabola() -> None:
 
 
 def test_conjugate_gradients_follow_rosenbrocks_valley() -> None:
-    x = np.array([[-1.2, 1.0]])
-    residual, directions, calls = run_rosenbrock(x, scratch((1, 2)), descent())
-    assert residual <= 1e-6
-    np.testing.assert_allclose(x, 1.0, atol=1e-5)
-    assert directions < 200
-    assert calls > directions
+    """From 13 starts, in lanes, which take their next start when they are done, and one after another: the same bits."""
+    x = np.concatenate([[[[-1.2, 1.0]]], np.random.default_rng(0).uniform(-2.0, 2.0, size=(12, 1, 2))])
+    found = by_gradients(run_rosenbrock, x, descent(), 8)
+    assert (found.residual <= 1e-6).all()
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-5)
+    assert (found.iterations < 200).all()
+    assert (found.evaluations > found.iterations).all()
+    assert len(np.unique(found.evaluations)) > 5  # lanes go their own ways
+    same_searches(found, by_gradients(run_rosenbrock, x, descent()))
 
 
 @pytest.mark.parametrize("n", [2, 5, 12])
 def test_conjugate_gradients_end_a_quadratic_in_its_dimension(n: int) -> None:
     """With exact line searches conjugate directions are done in n; rounding of energies (1e-16 of them) costs a few more."""
     k, b = spd(n, 30.0), np.arange(1.0, n + 1)
-    x = np.zeros((n, 1))
-    residual, directions, _ = run_quadratic(
-        (k, b), x, scratch((n, 1)), descent(tolerance=1e-5, line_tolerance=1e-9, longest_step=1e3)
-    )
-    assert residual <= 1e-5
-    assert directions <= n + 3
-    np.testing.assert_allclose(x[:, 0], np.linalg.solve(k, b), atol=1e-4)
+    settings = descent(tolerance=1e-5, line_tolerance=1e-9, longest_step=1e3)
+    found = by_gradients(partial(run_quadratic, (k, b)), np.zeros((1, n, 1)), settings)
+    assert found.residual[0] <= 1e-5
+    assert found.iterations[0] <= n + 3
+    np.testing.assert_allclose(found.x[0, :, 0], np.linalg.solve(k, b), atol=1e-4)
+
+
+def test_conjugate_gradients_end_at_their_caps() -> None:
+    """Of directions: exactly so many. Of precision: no tolerance, so the search ends where no energy is lower."""
+    x = np.array([[[-1.2, 1.0]], [[1.0, 1.0]], [[2.0, -1.0]]])
+    found = by_gradients(run_rosenbrock, x, descent(max_iterations=7), 8)
+    np.testing.assert_array_equal(found.iterations, (7, 0, 7))
+    assert (found.residual[[0, 2]] > 1e-6).all()
+    stuck = by_gradients(run_rosenbrock, x, descent(tolerance=0.0), 8)
+    assert (stuck.iterations < 5000).all()
+    np.testing.assert_allclose(stuck.x, 1.0, atol=1e-6)
+    same_searches(stuck, by_gradients(run_rosenbrock, x, descent(tolerance=0.0)))
+
+
+def relaxing(**changes: float) -> RelaxationSettings:
+    base = RelaxationSettings(tolerance=1e-8, max_iterations=5000, kinetic=False, softest=1e-3, longest_step=10.0)
+    return base._replace(**changes)
 
 
 @pytest.mark.parametrize("kinetic", [False, True])
 def test_relaxation_rests_at_the_minimum_of_a_quadratic(kinetic: bool) -> None:
+    """From 11 starts, in lanes and one after another: the same bits."""
     k, b = spd(6, 100.0), np.ones(6)
-    mass = np.full(6, 0.26 * 100.0)  # stable while mass > stiffness / 4
-    x = np.zeros((6, 1))
-    work = RelaxationWork(*(np.zeros((6, 1)) for _ in range(3)))
-    settings = RelaxationSettings(tolerance=1e-8, max_iterations=5000, kinetic=kinetic, softest=1e-3, longest_step=10.0)
-    residual, steps = run_relaxation((k, b), mass, x, work, settings)
-    assert residual <= 1e-8
-    assert steps < 2000
-    np.testing.assert_allclose(x[:, 0], np.linalg.solve(k, b), atol=1e-7)
+    mass = 0.26 * 100.0  # stable while mass > stiffness / 4
+    x = np.concatenate([np.zeros((1, 6, 1)), np.random.default_rng(0).normal(size=(10, 6, 1))])
+    found = by_relaxation((k, b), x, mass, relaxing(kinetic=kinetic), 8)
+    assert (found.residual <= 1e-8).all()
+    assert (found.iterations < 2000).all()
+    np.testing.assert_array_equal(found.evaluations, found.iterations + 1)
+    np.testing.assert_allclose(found.x[:, :, 0], np.linalg.solve(k, b)[None].repeat(11, 0), atol=1e-7)
+    same_searches(found, by_relaxation((k, b), x, mass, relaxing(kinetic=kinetic)))
 
 
 def test_relaxation_with_less_than_a_quarter_of_the_stiffness_runs_away() -> None:
     k, b = spd(6, 100.0), np.ones(6)
-    x = np.zeros((6, 1))
-    work = RelaxationWork(*(np.zeros((6, 1)) for _ in range(3)))
-    settings = RelaxationSettings(tolerance=1e-8, max_iterations=3000, kinetic=False, softest=1e-3, longest_step=10.0)
-    residual, _ = run_relaxation((k, b), np.full(6, 0.2 * 100.0), x, work, settings)
-    assert residual > 1.0
+    found = by_relaxation((k, b), np.zeros((1, 6, 1)), 0.2 * 100.0, relaxing(max_iterations=3000))
+    assert found.residual[0] > 1.0
+    assert found.iterations[0] == 3000
 
 
 def test_fictitious_masses_bound_a_quarter_of_the_stiffness() -> None:
@@ -191,6 +280,29 @@ def test_methods_agree_on_a_cell(method: str, options: SearchOptions) -> None:
     np.testing.assert_allclose(found.positions[:, :24], reference().positions[:, :24], atol=2e-3)
     assert (found.residual <= found.tolerance).all()
     assert found.hints == ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("cg", SearchOptions(tolerance=1e-3)),
+        ("cg", SearchOptions(max_iterations=50)),
+        ("relaxation", SearchOptions(tolerance=1e-4, damping="viscous")),
+        ("relaxation", SearchOptions(tolerance=1e-3, damping="kinetic")),
+    ],
+)
+def test_first_order_methods_give_the_same_bits_in_lanes_and_alone(method: str, options: SearchOptions) -> None:
+    """Eleven cells in eight lanes, reversed over two threads, and one at a time, which kernels search without lanes."""
+    stretches = np.random.default_rng(4).uniform(0.2, 0.8, size=(11, 1))
+    whole = form_find(stretches, lattice=CELL, method=method, options=options, threads=1)
+    other = form_find(stretches[::-1], lattice=CELL, method=method, options=options, threads=2)
+    assert whole.converged.all() == (options.max_iterations is None)
+    alone = [form_find(row, lattice=CELL, method=method, options=options) for row in stretches]
+    for name in ("positions", "converged", "iterations", "evaluations", "residual", "contact_force"):
+        values = getattr(whole, name)
+        np.testing.assert_array_equal(getattr(other, name)[::-1], values, err_msg=name)
+        for k in range(11):
+            np.testing.assert_array_equal(getattr(alone[k], name)[0], values[k], err_msg=f"{name} {k}")
 
 
 def test_same_bits_whatever_batch_order_or_threads() -> None:

@@ -11,9 +11,9 @@ from scipy.optimize import brentq
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import load, load1, select, sqrt, store
 from tensegrity_gym.core.newton import EquilibriumRecords, NewtonSettings, find_minima
-from tensegrity_gym.searches import newton_lanes, without_lanes
 from tensegrity_gym.stability import last_share
 from tensegrity_gym.types import BlockPattern
+from tensegrity_gym.workspaces import newton_lanes, without_lanes
 
 NO = np.zeros(0, dtype=np.int64)
 #: One mass, no members.

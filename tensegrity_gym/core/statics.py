@@ -97,18 +97,18 @@ def predict_tensions(statics, most_compression, x, d, tensions):
 
 
 @jit(forceinline=False)
-def change_held_masses(statics, x, f, tolerance):
-    """At an equilibrium of one lattice: hold what sank, let go what is pulled up. Returns whether anything changed.
+def change_held_masses(held, x, f, tolerance, lane):
+    """At an equilibrium of one lane: hold what sank, let go what is pulled up. Returns whether anything changed.
 
-    ``f`` as :func:`static_forces` leaves it.
+    ``held``, ``x`` and ``f`` have lanes; ``f`` as :func:`static_forces` leaves it.
     """
     changed = False
     for i in range(x.shape[0]):
-        if statics.held[i] == 0.0 and x[i, 2] < 0.0:
-            statics.held[i] = 1.0
-            x[i, 2] = 0.0
+        if held[i, lane] == 0.0 and x[i, 2, lane] < 0.0:
+            held[i, lane] = 1.0
+            x[i, 2, lane] = 0.0
             changed = True
-        elif statics.held[i] > 0.0 and f[i, 2] > tolerance:
-            statics.held[i] = 0.0
+        elif held[i, lane] > 0.0 and f[i, 2, lane] > tolerance:
+            held[i, lane] = 0.0
             changed = True
     return changed
