@@ -64,7 +64,7 @@ class GroundLanes(NamedTuple):
     mass: np.ndarray  #: as in DescentCases, shape (n_masses or 0, lanes)
     case: np.ndarray  #: which equilibrium each lane works on, -1 for none, shape (lanes,)
     rounds: np.ndarray  #: how often its held masses were chosen, shape (lanes,)
-    queue: np.ndarray  #: the next case and the last one but one, shape (2,)
+    queue: np.ndarray  #: the next case and the end of the share, shape (2,)
 
 
 class Batch(NamedTuple):
@@ -141,17 +141,30 @@ def next_lattice(statics, batch, lane, residual, iterations, evaluations):
     return True
 
 
-@jit(cache=True)
-def descend_equilibria(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress):
+# Tuples of arrays are made one call below the entry points, where numba counts no references: what counts would free them.
+@jit
+def find_by_descent(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress):
     """The equilibria of ``ground_lanes.queue`` by conjugate gradients."""
     statics = _statics(loads, ground, ground_work)
     batch = Batch(ground, cases, records, ground_lanes, ground_work, progress)
     conjugate_gradient(static_energy, free_forces, next_lattice, statics, batch, settings, lanes, work)
 
 
-@jit(cache=True)
-def relax_equilibria(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress):
+@jit
+def find_by_relaxation(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress):
     """The equilibria of ``ground_lanes.queue`` by dynamic relaxation."""
     statics = _statics(loads, ground, ground_work)
     batch = Batch(ground, cases, records, ground_lanes, ground_work, progress)
     relax(free_forces, next_lattice, statics, batch, settings, lanes, work)
+
+
+@jit(cache=True)
+def descend_equilibria(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress):
+    """:func:`find_by_descent`, compiled once and cached."""
+    find_by_descent(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress)
+
+
+@jit(cache=True)
+def relax_equilibria(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress):
+    """:func:`find_by_relaxation`, compiled once and cached."""
+    find_by_relaxation(loads, ground, settings, cases, records, ground_lanes, ground_work, lanes, work, progress)
