@@ -41,8 +41,7 @@ def accuracy(config: Config) -> None:
         "\nmethod                           tol/Pcr  converged  iterations  CPU/eq [ms]  vs newton  residual [N]"
         "  dE [J]    nodes [m]  touchdown [m]"
     )
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6))
-    base = 0.0
+    base, errors = 0.0, {}
     for name, method, count, options, tolerances in runs:
         rows = []
         for few in (1, 8):  # compile, without lanes and with
@@ -66,16 +65,30 @@ def accuracy(config: Config) -> None:
                 f"  {energy:8.1e}  {nodes:9.1e}  {shift:9.1e}",
                 flush=True,
             )
-        values = np.array(rows)
+        errors[name] = np.array(rows)
+    draw_accuracy(config, errors)
+    physical_relaxation(batch[:many], base)
+
+
+def draw_accuracy(config: Config, errors: dict[str, np.ndarray]) -> None:
+    """``errors``: rows of CPU time [s], energy error [J], node error [m], touchdown shift [m] by the method's name."""
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6))
+    colours: dict[str, str] = {}
+    for name, values in errors.items():
+        alone = name.endswith("one by one")
+        method = name.removesuffix(", one by one").removesuffix(", batch of 64")
         for axis, column in zip(axes, (1, 2, 3), strict=True):
-            axis.loglog(values[:, 0], np.maximum(values[:, column], 1e-15), "o-", label=name)
+            shown = {"color": colours[method]} if method in colours else {"label": method}
+            (line,) = axis.loglog(values[:, 0], np.maximum(values[:, column], 1e-15), "s" if alone else "o-", **shown)
+            line.set_markerfacecolor("white" if alone else line.get_color())
+        colours[method] = line.get_color()
     for axis, title in zip(axes, ("energy error [J]", "node error [m]", "touchdown shift [m]"), strict=True):
         axis.set_xlabel("CPU time per equilibrium [s]")
         axis.set_title(title)
         axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=7)
+    axes[0].plot([], [], "s", color="grey", markerfacecolor="white", label="one by one")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=6, fontsize=8)
     save(figure, config, "accuracy")
-    physical_relaxation(batch[:many], base)
 
 
 def beyond_float64(batch: np.ndarray) -> Equilibria:
