@@ -140,12 +140,12 @@ def replace_converged(found: Equilibria) -> Equilibria:
 def line_search(config: Config) -> None:
     """Fine against coarse line searches, on one cell."""
     cell = Lattice(1, 1)
-    batch = stretches(2 if config.quick else 6, config.seed, 1)
+    batch = stretches(8 if config.quick else 24, config.seed, 1)
     tolerances = (1.0, 0.3, 0.1, 0.01, 1e-3)
     caps = (1, 3, 20)
     print("\nline search on one cell: tolerance, cap of parabolas -> directions, energies per direction, CPU/eq [ms], converged")
     figure, axis = plt.subplots(figsize=(5, 3.4))
-    form_find(batch[:1], lattice=cell, method="cg", options=SearchOptions(max_iterations=1))
+    form_find(batch, lattice=cell, method="cg", options=SearchOptions(max_iterations=1))
     for cap in caps:
         times = []
         for tolerance in tolerances:
