@@ -2,50 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import qmc
 
 from tensegrity_gym import Design, Equilibria, HopResult, Lattice, Scene, form_find, simulate
+from tensegrity_gym.calibration import MATERIAL, POSITION
+from tensegrity_gym.specimen import Specimen
 from tensegrity_gym.timestep import default_time_step
-from tensegrity_gym.types import Floats, Structure
-
-#: Nobody knows a position better [m].
-POSITION = 1e-5
-#: Nor a stiffness, from member to member [-].
-MATERIAL = 1e-3
+from tensegrity_gym.types import Floats
 
 
 def stretches(n: int, actuators: int = 4, seed: int = 0) -> Floats:
     """``n`` scrambled Sobol points over the paper's range, shape (n, actuators)."""
     points = qmc.Sobol(actuators, seed=seed).random_base2(int(np.ceil(np.log2(n))))[:n]
     return 0.2 + 0.6 * points
-
-
-@dataclass(frozen=True)
-class ScatteredDesign(Design):
-    """A design whose members differ: every stiffness is its own, with a normal scatter.
-
-    Dampings scatter with the stiffnesses they belong to, so that loss factors stay.
-    """
-
-    scatter: float = MATERIAL
-    """Standard deviation of a member's stiffness over its mean [-]."""
-    seed: int = 1
-    """Which specimen, from 1 on."""
-
-    def structure(self, lattice: Lattice) -> Structure:
-        """One specimen of ``lattice``."""
-        rng, nominal, changed = np.random.default_rng(self.seed), super().structure(lattice), {}
-        for name, damping in (("cable_stiffness", True), ("segment_stiffness", True), ("hinge_stiffness", True)):
-            factor = 1.0 + self.scatter * rng.standard_normal(len(getattr(nominal, name)))
-            changed[name] = getattr(nominal, name) * factor
-            if damping:
-                other = name.replace("stiffness", "damping")
-                changed[other] = getattr(nominal, other) * factor
-        factor = 1.0 + self.scatter * rng.standard_normal(len(nominal.actuator_rigidity))
-        return nominal._replace(**changed, actuator_rigidity=nominal.actuator_rigidity * factor)
 
 
 def hop_perturbed(
@@ -82,8 +54,7 @@ def hop_perturbed(
         again = form_find(found.stretches + noise, design=design, scene=scene, lattice=lattice, threads=1, outside=True)
         return simulate(again.stretches, design=design, equilibria=again, **options)  # type: ignore[arg-type]
     if kind == "material":
-        values = {k: v for k, v in vars(design).items() if k in Design.__dataclass_fields__}
-        specimen = ScatteredDesign(**values, scatter=MATERIAL if size is None else size, seed=seed)
+        specimen = Specimen.of(design, seed, MATERIAL if size is None else size)
         again = form_find(found.stretches, design=specimen, scene=scene, lattice=lattice, threads=1)
         step = default_time_step(design, lattice)  # one step for all: a specimen's own critical step differs in the last digit
         return simulate(found.stretches, design=specimen, equilibria=again, dt=step, **options)  # type: ignore[arg-type]
