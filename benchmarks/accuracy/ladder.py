@@ -224,9 +224,9 @@ def report(d: Data) -> list[str]:
 def plot(d: Data) -> Figure:
     """Error against processor time for both landings; one colour a lever, the front, the floor."""
     names = list(dict.fromkeys(d["scene"].tolist()))
-    figure, axes = plt.subplots(2, len(names), figsize=(4.3 * len(names), 7.2), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(2, len(names), figsize=(3.9 * len(names), 7.0), layout="constrained", squeeze=False)
     levers = list(dict.fromkeys(d["lever"].tolist()))
-    colours = {lever: f"C{k}" if k < 10 else ("k", "0.5", "m")[k - 10] for k, lever in enumerate(levers)}
+    colours = {lever: f"C{k}" if k < 10 else ("k", "magenta", "y")[k - 10] for k, lever in enumerate(levers)}
     for column, scene_name in enumerate(names):
         for axis, name in zip(axes[:, column], LANDINGS, strict=True):
             here = np.flatnonzero(d["scene"] == scene_name)
@@ -247,7 +247,8 @@ def plot(d: Data) -> Figure:
             axis.grid(alpha=0.3, which="both", lw=0.4)
     for axis in axes[:, 0]:
         axis.set_ylabel("distance from the converged landing [m]")
-    axes[0, -1].legend(fontsize=6, loc="upper right")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=7, loc="outside lower center", ncols=5)
     return figure
 
 
