@@ -25,6 +25,9 @@ EVENTS = ("release", "take-off", "touchdown", "end")
 def hop(
     stretches: tuple[float, float, float, float] = (0.3, 0.3, 0.3, 0.3),
     scene: str = "earth",
+    landing: str = "rest",
+    fidelity: str = "paper",
+    tolerance: float | None = None,
     picture: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="GIF|MP4")] = None,
 ) -> None:
@@ -33,15 +36,18 @@ def hop(
     Args:
         stretches: rest lengths of the four actuated cables over the height of the unloaded cell, each in [0.2, 0.8].
         scene: name of a scene preset.
+        landing: where the landing is read, rest or touchdown.
+        fidelity: paper, single (the same in float32), reference (converged in time), or auto.
+        tolerance: on the landing [m], with auto; the scene's floor if not given.
         picture: write a filmstrip of the hop here.
         video: write a film of the hop, at half speed, here.
     """
-    where = Scene.preset(scene)
+    where = Scene.preset(scene, landing=landing)
     for path in (picture, video):
         check_writable(path)
     if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp"):
         raise InvalidParameterError(f"--picture: expected a path that ends in .png, .jpg or .webp, got {str(picture)!r}")
-    result = simulate(stretches, scene=where, trajectory_rate=240.0 if picture else None)
+    result = simulate(stretches, scene=where, fidelity=fidelity, tolerance=tolerance, trajectory_rate=240.0 if picture else None)
     print(summary(result, where))
     if picture is not None and result.trajectory is not None:
         from PIL import Image
@@ -142,6 +148,7 @@ def summary(result: HopResult, scene: Scene) -> str:
         f"flight time       {result.flight_time[0]:.4f} s",
         f"stored energy     {result.stored_energy[0]:.3f} J",
         f"time step         {result.dt * 1e6:.3g} us",
+        f"fidelity          {result.fidelity}",
         "",
         "energies [J]".ljust(24) + "".join(f"{event:>12}" for event in EVENTS),
     ]

@@ -89,6 +89,7 @@ class Fidelity:
 #: Fidelities by name; "auto" is chosen for a scene and a tolerance, see :mod:`tensegrity_gym.auto`.
 FIDELITIES = {
     "paper": Fidelity(reason="the paper's model"),
+    "single": Fidelity(precision="float32", reason="the paper's model in single precision"),
     "reference": Fidelity(step=MARGIN / 8, reason="the paper's model, converged in time"),
 }
 NAMES = ("auto", *FIDELITIES)

@@ -38,8 +38,9 @@ def simulate(
 
     All actuators are unlocked at once at time 0 and the hop is followed to rest, at most for ``scene.duration``.
 
-    * ``fidelity`` is "paper" (the paper's model), "reference" (that one converged in time), "auto" (the cheapest one known to
-      hold ``tolerance`` [m] on the landing, by default the scene's floor; see ``docs/accuracy.md``) or a Fidelity.
+    * ``fidelity`` is "paper" (the paper's model), "single" (that in float32), "reference" (that converged in time), "auto" (the
+      cheapest one known to hold ``tolerance`` [m] on the landing, by default the scene's floor; see ``docs/accuracy.md``) or a
+      Fidelity.
     * ``dt`` [s], ``integrator`` and ``precision`` override the fidelity's. A ``dt`` above the critical step is refused unless
       ``allow_unstable``.
     * ``trajectory_rate`` [Hz] asks for frames; it changes nothing else.

@@ -37,8 +37,6 @@ TARGET_PLACES = ("inside", "boundary", "beyond")
 BEYOND = (1.1, 1.5)
 #: What a fidelity may be made of, if it is given as a mapping.
 LEVERS = ("dt", *(f.name for f in fields(Fidelity) if f.name != "reason"))
-#: Names of fidelities: those of ``simulate``, and the paper's in single precision.
-FIDELITY_NAMES = (*NAMES, "single")
 
 #: How far a rounded action may lie out of its range [-]: four units in the last place of float32 there.
 ROUNDING = 4 * float(np.spacing(np.float32(STRETCH_RANGE[1])))
@@ -260,22 +258,18 @@ def check_action(action: Any, shape: tuple[int, ...]) -> Floats:
 
 
 def check_fidelity(fidelity: str | Fidelity | Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of ``simulate`` that a fidelity means: one of ``FIDELITY_NAMES``, a Fidelity, or a mapping of ``LEVERS``.
+    """Arguments of ``simulate`` that a fidelity means: one of its names, a Fidelity, or a mapping of ``LEVERS``.
 
     A mapping names what differs from the paper's model.
     """
     if isinstance(fidelity, Fidelity) or (isinstance(fidelity, str) and fidelity in NAMES):
         return {"fidelity": fidelity}
-    if isinstance(fidelity, str) and fidelity == "single":
-        return {"precision": "float32"}
     if isinstance(fidelity, Mapping) and set(fidelity) <= set(LEVERS):
         levers = dict(fidelity)
         step = levers.pop("dt", None)
         made = changed(named_fidelity("paper"), levers)
         return {"fidelity": made} | ({} if step is None else {"dt": positive("dt", step)})
-    raise InvalidParameterError(
-        f"fidelity: expected one of {FIDELITY_NAMES}, a Fidelity or a mapping of {LEVERS}, got {fidelity!r}"
-    )
+    raise InvalidParameterError(f"fidelity: expected one of {NAMES}, a Fidelity or a mapping of {LEVERS}, got {fidelity!r}")
 
 
 def simulate_hops(

@@ -253,7 +253,7 @@ def test_fidelity_is_what_simulate_is_asked_for(monkeypatch: pytest.MonkeyPatch)
         ("paper", {"fidelity": "paper"}),
         ("reference", {"fidelity": "reference"}),
         ("auto", {"fidelity": "auto"}),
-        ("single", {"precision": "float32"}),
+        ("single", {"fidelity": "single"}),
         (rough, {"fidelity": rough}),
         ({"step": 0.9, "stop": "landing"}, {"fidelity": rough}),
         ({"dt": 1e-6, "integrator": "velocity_verlet"}, {"dt": 1e-6, "fidelity": Fidelity(integrator="velocity_verlet")}),

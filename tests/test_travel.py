@@ -151,7 +151,7 @@ def test_every_option_does_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None
         nearer = (info["distance"] - after["distance"]) / info["reach"]
         assert arrived == (after["distance"] <= 2.999 * info["reach"])
         assert reward == pytest.approx(nearer - 0.7 + 4.0 * arrived, rel=1e-12)
-    assert {one["precision"] for one in asked} == {"float32"}
+    assert {one["fidelity"] for one in asked} == {"single"}
 
 
 def test_a_failed_hop_gets_the_worst_reward_and_ends_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
