@@ -37,7 +37,7 @@ def measure(options: Options) -> Data:
     """Of each case and tolerance: share of the hops within it, cost, and that of the cheapest that would have done."""
     rows: dict[str, list] = {name: [] for name in ("case", "tolerance", "share", "cost", "cheapest", "model", "realtime")}
     for scene_name, landing in CASES[: options.size(len(CASES), 1)]:
-        n = options.size(200 if landing == "touchdown" else 100, 16)
+        n = options.size(200 if landing == "touchdown" else 100, 8)
         floor = stored_calibration(scene_name, landing)
         if floor is None:
             raise SystemExit(f"auto: expected a calibration of {scene_name}; run python -m tensegrity_gym calibrate --save")

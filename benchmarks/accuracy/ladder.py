@@ -137,7 +137,7 @@ def measure(options: Options) -> Data:
     chosen = list(points())
     if options.quick:
         dear = ("velocity Verlet", "Runge-Kutta", "bar segments")
-        chosen = [p for p in chosen if p.lever not in dear][::3]
+        chosen = [p for p in chosen if p.lever not in dear][::5]
     rows: dict[str, list[Any]] = {name: [] for name in ("scene", "lever", "label", "seconds", "statics", *ERRORS)}
     data: Data = {}
     for scene_name in SCENES[: options.size(3, 1)]:
