@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tensegrity_gym.batch import Progress
+from tensegrity_gym.calibration import sample_stretches
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.formfinding import STRETCH_RANGE
 from tensegrity_gym.hops import HopResult
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import LANDINGS, Scene
@@ -109,11 +109,7 @@ def measure_reach(scene: Scene, hops: int = 256, seed: int = 0, progress: Progre
 
     The lattice's symmetries map hops onto hops (on a slope, those that keep its direction), so each counts with its images.
     """
-    low, high = STRETCH_RANGE
-    from scipy.stats import qmc  # heavy to import, and only this command needs it
-
-    sobol = qmc.Sobol(d=4, seed=seed).random_base2(int(np.ceil(np.log2(hops))))[:hops]
-    result = simulate(low + (high - low) * sobol, scene=scene, progress=progress)
+    result = simulate(sample_stretches(hops, seed), scene=scene, progress=progress)
     return {landing: _region_of(_landings(result, landing), scene) for landing in LANDINGS}
 
 

@@ -96,9 +96,34 @@ def test_critical_step_with_lagged_damping(damping_ratio: float) -> None:
         assert (growth(s, NOTHING, x, factor * exact, 4000) > 1e3) == grows
 
 
-def growth(s: Structure, lengths: np.ndarray, at: np.ndarray, dt: float, steps: int) -> float:
-    """Largest speed after ``steps`` over that of a small random start [-]; infinite if it overflowed."""
-    v = np.random.default_rng(0).normal(size=at.shape) * 1e-6
+@pytest.mark.parametrize("damping_ratio", [0.0, 0.3, 1.0])
+def test_critical_step_of_a_hinge(damping_ratio: float) -> None:
+    """Three masses m, two segments l that hardly resist stretching: theta = (u1 - 2 u2 + u3)/l, so omega^2 = 6 kappa/(m l^2).
+
+    Springs of a thousandth of kappa/l^2 along the axis leave this mode alone. Damping acts on the rate of the angle: moving in
+    one plane it is linear, at angles well above the 1e-6 rad below which it fades.
+    """
+    mass, length, hinge = 0.2, 0.3, 9.0
+    omega = np.sqrt(6 * hinge / mass) / length
+    s = naive.make_structure(
+        [mass] * 3,
+        bars=[[0, 1, 2]],
+        segment_stiffness=1e-3 * hinge / length**2,
+        segment_length=length,
+        hinge_stiffness=hinge,
+        hinge_damping=2 * damping_ratio * hinge / omega,
+    )
+    x = np.arange(3)[:, None] * [length, 0, 0] + [0, 0, 5.0]
+    exact = 2 / omega * (np.sqrt(1 + damping_ratio**2) - damping_ratio)
+    assert critical_time_step(s, x) == pytest.approx(exact, rel=1e-5)
+    in_plane = 1e-4 * np.array([[0.0, 0, 1], [0, 0, -2], [0, 0, 1]])
+    for factor, grows in ((0.99, False), (1.01, True)):
+        assert (growth(s, NOTHING, x, factor * exact, 120, in_plane) > 10) == grows
+
+
+def growth(s: Structure, lengths: np.ndarray, at: np.ndarray, dt: float, steps: int, v: np.ndarray | None = None) -> float:
+    """Largest speed after ``steps`` over that of the start ``v``, else a small random one [-]; infinite if it overflowed."""
+    v = np.random.default_rng(0).normal(size=at.shape) * 1e-6 if v is None else v.copy()
     v -= (s.mass[:, None] * v).sum(axis=0) / s.mass.sum()
     x, f, start = at.copy(), np.zeros_like(at), np.abs(v).max()
     memory, losses = np.zeros(s.n_axial_members), np.zeros(3)
