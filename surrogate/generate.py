@@ -64,7 +64,8 @@ class GenerateConfig:
     design: Design = field(default_factory=Design)
     """Materials and sizes."""
     fidelity: str = "paper"
-    """paper, reference (converged in time), or auto: the cheapest model known to hold --tolerance."""
+    """paper, single (precision), flown (single, rigid in flight and no further than the landing: many times cheaper to
+    touchdown), reference (converged in time), or auto: the cheapest model known to hold --tolerance."""
     tolerance: float | None = None
     """On the landing, with --fidelity auto [m]; None: the scene's floor."""
     stop: str | None = None

@@ -37,7 +37,8 @@ def hop(
         stretches: rest lengths of the four actuated cables over the height of the unloaded cell, each in [0.2, 0.8].
         scene: name of a scene preset.
         landing: where the landing is read, rest or touchdown.
-        fidelity: paper, single (the same in float32), reference (converged in time), or auto.
+        fidelity: paper, single (the same in float32), flown (that, rigid in flight, no further than the landing), reference
+            (converged in time), or auto.
         tolerance: on the landing [m], with auto; the scene's floor if not given.
         picture: write a filmstrip of the hop here.
         video: write a film of the hop, at half speed, here.

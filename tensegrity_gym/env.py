@@ -76,7 +76,7 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
         success_radius: errors up to this are a success [reaches].
         success_bonus: added to the reward of a success [-].
         energy_cost: taken off the reward per joule stored [1/J].
-        fidelity: "paper", "single", "reference", "auto", a Fidelity, or a mapping of what differs from the paper's model.
+        fidelity: "paper", "single", "flown", "reference", "auto", a Fidelity, or a mapping of what differs from "paper".
         render_mode: None; "rgb_array": the posture before the hop, then a filmstrip of it; "rgb_array_list": all frames
             since the last look, at ``render_fps``; "human": a window that shows them in real time.
     """

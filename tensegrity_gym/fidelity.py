@@ -90,6 +90,12 @@ class Fidelity:
 FIDELITIES = {
     "paper": Fidelity(reason="the paper's model"),
     "single": Fidelity(precision="float32", reason="the paper's model in single precision"),
+    "flown": Fidelity(
+        precision="float32",
+        flight="rigid",
+        stop="landing",
+        reason="the paper's model in single precision, rigid in flight and followed as far as the landing",
+    ),
     "reference": Fidelity(step=MARGIN / 8, reason="the paper's model, converged in time"),
 }
 NAMES = ("auto", *FIDELITIES)

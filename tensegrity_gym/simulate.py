@@ -38,7 +38,8 @@ def simulate(
 
     All actuators are unlocked at once at time 0 and the hop is followed to rest, at most for ``scene.duration``.
 
-    * ``fidelity`` is "paper" (the paper's model), "single" (that in float32), "reference" (that converged in time), "auto" (the
+    * ``fidelity`` is "paper" (the paper's model), "single" (that in float32), "flown" (that, rigid in
+      flight and followed no further than the landing), "reference" (the paper's converged in time), "auto" (the
       cheapest one known to hold ``tolerance`` [m] on the landing, by default the scene's floor; see ``docs/accuracy.md``) or a
       Fidelity.
     * ``dt`` [s], ``integrator`` and ``precision`` override the fidelity's. A ``dt`` above the critical step is refused unless

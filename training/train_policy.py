@@ -19,10 +19,9 @@ from surrogate.model import one_thread
 from surrogate.storage import hash_of
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.task import reach
+from tensegrity_gym.task import check_fidelity, reach
 from training import checkpoint
 from training.algorithms import build, env_count, hyperparameters
-from training.models import levers_of
 from training.policies import ActorPolicy
 from training.sb3_vec_env import BatchedHopVecEnv
 
@@ -47,7 +46,7 @@ class PolicyConfig:
     envs: int = 16
     """Envs whose hops are simulated together; halved until it divides ``calls``, so that no hop is over budget."""
     fidelity: str = "paper"
-    """Model of the hop, see training/models.py: paper, single (precision), or flown."""
+    """Model of the hop, one that the envs know by name: paper, single, flown, ..."""
     checkpoint_every: int = 512
     """Hops between two checkpoints, where there is a file to keep them in."""
     evaluate_every: int = 0
@@ -134,7 +133,7 @@ def train_policy(
     plain = asdict(config) | {"hyperparameters": values}
     settings = hash_of({"config": plain, "scene": asdict(scene), "budgets": sorted(budgets)})
     with contextlib.ExitStack() as stack:
-        hops = BatchedHopVecEnv(scene, scale, envs, levers_of(config.fidelity))
+        hops = BatchedHopVecEnv(scene, scale, envs, check_fidelity(config.fidelity))
         venv = stack.enter_context(contextlib.closing(VecMonitor(hops)))
         bar = stack.enter_context(
             tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
@@ -158,7 +157,7 @@ def train_policy(
 
 
 def _evaluation(stack: contextlib.ExitStack, scene: Scene, scale: float, config: PolicyConfig) -> EvalCallback:
-    venv = BatchedHopVecEnv(scene, scale, 16, levers_of(config.fidelity))
+    venv = BatchedHopVecEnv(scene, scale, 16, check_fidelity(config.fidelity))
     venv.seed(config.seed + EVALUATION_SEED)
     monitored = stack.enter_context(contextlib.closing(VecMonitor(venv)))
     every = max(1, config.evaluate_every // env_count(config.calls, config.envs))

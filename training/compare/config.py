@@ -25,7 +25,7 @@ class CompareConfig:
     landing: str = "touchdown"
     """Where a landing is read: touchdown or rest."""
     fidelity: str = "paper"
-    """Model of the hop, for learning and for scoring alike, see training/models.py: paper, single (precision), or flown."""
+    """Model of the hop, for learning and for scoring alike, one that the envs know by name: paper, single, flown, ..."""
     duration: float | None = None
     """Longest time that a hop is followed [s]; None: the scene's. A touchdown needs no more than the longest flight."""
     data: Path | None = None

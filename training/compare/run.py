@@ -16,13 +16,13 @@ from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
 from tensegrity_gym import Scene
+from tensegrity_gym.task import check_fidelity
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
 from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, save_net, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.kriging import Kriging
-from training.models import levers_of
 from training.planner import BestOfPlanner, NearestHopPlanner, Planner
 from training.policies import ActorPolicy
 from training.refine import RefiningPlanner
@@ -43,7 +43,7 @@ class Comparison:
         self.config = config
         changes = {} if config.duration is None else {"duration": config.duration}
         self.scene = Scene.preset(config.scene, landing=config.landing, **changes)
-        self.hops = Hops(self.scene, levers_of(config.fidelity), config.threads)
+        self.hops = Hops(self.scene, check_fidelity(config.fidelity), config.threads)
         self.stages = Stages(Path(config.out), say=print if config.progress else lambda _: None)
         self.places = registered.read(config.scene, config.landing, config.targets)
         self.targets = np.concatenate(list(self.places.values()))
