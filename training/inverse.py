@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,7 +14,6 @@ from surrogate.generate import sample_stretches
 from surrogate.model import one_thread
 from tensegrity_gym import STRETCH_RANGE
 from tensegrity_gym.errors import InvalidParameterError
-from training.kriging import Kriging
 from training.planner import Prediction, targets_of
 
 #: Added to the variance under the root, so that its derivative exists where it is zero [m^2].
@@ -72,7 +70,8 @@ class InversePlanner:
 
     Args:
         landing: stretches, shape (n, n_actuators), to landings as each member sees them, shape (members, n, 2) [m].
-        correction: stretches to a shift of the landing, shape (n, 2) [m], and a variance, shape (n,) [m^2] a direction.
+        correction: stretches to a shift of the landing, shape (n, 2) [m], and a variance, shape (n,) [m^2] a direction; or
+            groups of close stretches (n, k, n_actuators) to (n, k, 2) and (n, k).
         energy: stretches to the energy that they store, shape (n,) [J]: chooses among equals.
         stored: stretches to start from besides the spread-out ones, shape (m, n_actuators).
     """
@@ -126,23 +125,19 @@ class InversePlanner:
         found = torch.gather(found, 1, order[..., None].expand_as(found))
         return np.stack([_distinct(row, count) for row in _in_range(found)])
 
+    @one_thread()
     @torch.no_grad()
-    def told(self, stretches: np.ndarray, landings: np.ndarray) -> InversePlanner:
-        """A planner that knows where more hops landed, shapes (m, n_actuators) and (m, 2) [m]; its correction must be Kriging."""
-        if not isinstance(self.correction, Kriging):
-            raise InvalidParameterError("told: expected a planner with kriging as its correction, which alone learns from hops")
-        points, there = (torch.from_numpy(np.asarray(a, dtype=np.float32)) for a in (stretches, landings))
-        more = copy.copy(self)
-        missed = landings - self.landing(points).mean(dim=0).numpy()
-        more.correction = self.correction.told(np.asarray(stretches), missed)
-        more.pool = torch.cat([self.pool, points])
-        mean, variance = self.pool_seen
-        more.pool_seen = torch.cat([mean, there]), torch.cat([variance, torch.zeros(len(points))])
-        return more
+    def slope(self, stretches: np.ndarray) -> np.ndarray:
+        """How the expected landing changes with the stretches (n, n_actuators), shape (n, 2, n_actuators) [m]."""
+        return self._seen(torch.from_numpy(np.asarray(stretches, dtype=np.float32)))[1][:, :2].numpy().astype(np.float64)
 
     def see(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean landing (n, 2) [m] and its variance, both directions added (n,) [m^2], at stretches (n, n_actuators)."""
-        landings = self.landing(stretches)
+        """Mean landing (n, 2) [m] and its variance, both directions added (n,) [m^2], at stretches (n, n_actuators).
+
+        Stretches may come in groups of close ones, (n, k, n_actuators); shapes are then (n, k, 2) and (n, k).
+        """
+        landings = self.landing(stretches.reshape(-1, stretches.shape[-1]))
+        landings = landings.reshape(len(landings), *stretches.shape[:-1], 2)
         mean = landings.mean(dim=0)
         if self.correction is None:
             return mean, ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
@@ -182,17 +177,22 @@ class InversePlanner:
         return best, cost
 
     def _residual(self, stretches: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Landing minus goal and the root of the variance, (n, 3) [m], and their derivatives, (n, 3, n_actuators) [m].
+        """Landing minus goal and the root of the variance, (n, 3) [m], and their derivatives, (n, 3, n_actuators) [m]."""
+        seen, slope = self._seen(stretches)
+        return seen - nn.functional.pad(goal, (0, 1)), slope
+
+    def _seen(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
+        """Landing and the root of the variance, (n, 3) [m], and their derivatives, (n, 3, n_actuators) [m].
 
         Differences along each stretch, towards the middle of its range, all in one pass of the net: for nets this small a
         pass costs more for being one than for what is in it, and derivatives need not be exact to lead to an exact end.
         """
         step = torch.where(stretches < sum(STRETCH_RANGE) / 2, DIFFERENCE, -DIFFERENCE)  # (n, n_actuators)
         points = torch.cat([stretches[:, None], stretches[:, None] + torch.diag_embed(step)], dim=1)
-        mean, variance = self.see(points.reshape(-1, points.shape[2]))
-        seen = torch.cat([mean, torch.sqrt(variance + LEAST_VARIANCE)[:, None]], dim=1).reshape(*points.shape[:2], 3)
+        mean, variance = self.see(points)
+        seen = torch.cat([mean, torch.sqrt(variance + LEAST_VARIANCE)[..., None]], dim=2)
         slope = (seen[:, 1:] - seen[:, :1]) / step[..., None]
-        return seen[:, 0] - nn.functional.pad(goal, (0, 1)), slope.mT
+        return seen[:, 0], slope.mT
 
     def _least_energy(self, found: Tensor, cost: Tensor) -> Tensor:
         assert self.energy is not None

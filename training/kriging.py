@@ -50,34 +50,38 @@ class Kriging:
         self.residuals = (residuals[:, None] * signs).reshape(-1, 2)
         self.tree = KDTree(self.stretches)
 
-    def told(self, stretches: Floats, residuals: Floats) -> Kriging:
-        """With more hops, shapes (m, n_actuators) and (m, 2) [m]."""
-        more = Kriging(stretches, residuals, self.permutations, self.signs, self.scale)
-        more.stretches = np.concatenate([more.stretches, self.stretches])
-        more.residuals = np.concatenate([more.residuals, self.residuals])
-        more.tree = KDTree(more.stretches)
-        return more
-
     def __call__(self, stretches: Tensor) -> tuple[Tensor, Tensor]:
         shift, share = self.shift(stretches.numpy().astype(np.float64))
         variance = self.scale.sigma**2 * (share + self.scale.noise)
         return torch.from_numpy(shift.astype(np.float32)), torch.from_numpy(variance.astype(np.float32))
 
     def shift(self, at: Floats) -> tuple[Floats, Floats]:
-        """Expected residual (n, 2) [m] and the share of the variance that stays in doubt (n,), at stretches (n, n_actuators)."""
+        """Expected residual (n, 2) [m] and the share of the variance that stays in doubt (n,), at stretches (n, n_actuators).
+
+        Groups of close stretches (n, k, n_actuators) ask the neighbours of the first one, with shapes (n, k, 2) and (n, k).
+        """
+        groups = at.reshape(len(at), -1, at.shape[-1])
         count = min(NEIGHBOURS, len(self.stretches))
-        distance, near = self.tree.query(at, count)
-        distance, near = distance.reshape(len(at), count), near.reshape(len(at), count)
+        near = self.tree.query(groups[:, 0], count)[1].reshape(len(groups), count)
         points = self.stretches[near]  # (n, count, n_actuators)
-        kernel = self._kernel(np.linalg.norm(points[:, :, None] - points[:, None], axis=3))
-        seen = self._kernel(distance)
-        weights = np.linalg.solve(kernel + self.scale.noise * np.eye(count), seen[..., None])[..., 0]
-        shift = (weights[:, None] @ self.residuals[near])[:, 0]
-        return shift, np.clip(1 - (weights * seen).sum(axis=1), 0, 1)
+        kernel = self._kernel(_distances(points, points))
+        seen = self._kernel(_distances(points, groups))  # (n, count, k)
+        weights = np.linalg.solve(kernel + self.scale.noise * np.eye(count), seen)
+        shift = weights.swapaxes(1, 2) @ self.residuals[near]
+        share = np.clip(1 - (weights * seen).sum(axis=1), 0, 1)
+        return shift.reshape(*at.shape[:-1], 2), share.reshape(at.shape[:-1])
 
     def _kernel(self, distance: Floats) -> Floats:
         scaled = np.sqrt(3) * distance / self.scale.length
         return (1 + scaled) * np.exp(-scaled)
+
+
+def _distances(points: Floats, others: Floats) -> Floats:
+    """Between points (n, p, d) and others (n, q, d), shape (n, p, q)."""
+    square = np.zeros((len(points), points.shape[1], others.shape[1]))
+    for k in range(points.shape[2]):  # a few dimensions: a loop moves far less memory than their difference tensor
+        square += (points[:, :, None, k] - others[:, None, :, k]) ** 2
+    return np.sqrt(square)
 
 
 @one_thread()

@@ -1,4 +1,9 @@
-"""Plan, simulate the plan, learn from it, plan again: a few simulator calls an answer, each chosen by what the last one told."""
+"""Plan, simulate the plan, correct it by what it missed: a few simulator calls an answer, each chosen by what the last one told.
+
+Between the stored hops the map is rough, and a surrogate errs by millimetres there; close by it runs much as the surrogate's
+slope says. So the answer is corrected by least-norm steps of that slope, which itself is corrected by every hop (Broyden's
+rank-one update; Nocedal and Wright 2006, eq. 11.26).
+"""
 
 from __future__ import annotations
 
@@ -6,16 +11,20 @@ from typing import Any
 
 import numpy as np
 
+from tensegrity_gym import STRETCH_RANGE
 from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.types import Floats
 from training.inverse import InversePlanner
 from training.planner import Land, Prediction, targets_of
 
+#: Longest step in one stretch: beyond it the slope says nothing.
+LONGEST_STEP = 0.05
+#: Length of steps, in stretches, over which landings scatter as much as they run: shorter ones hardly correct the slope.
+SCATTER_STEP = 1e-3
+
 
 class RefiningPlanner:
-    """Answer with the best of ``tries`` hops, each of which is planned with those before it in memory.
-
-    The map is rough between the stored hops, but smooth close by: a handful of hops around an answer tell how it runs there.
-    """
+    """Answer with the best of ``tries`` hops, each a step of the secant method from the best so far."""
 
     def __init__(self, inverse: InversePlanner, land: Land, tries: int = 8) -> None:
         if tries < 1:
@@ -29,20 +38,45 @@ class RefiningPlanner:
     ) -> Prediction:
         """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4); each costs ``tries`` simulator calls."""
         targets = targets_of(observation)
-        planners = [self.inverse] * len(targets)
         asked = self.inverse.plan(targets).stretches
-        best, least = asked.copy(), np.full(len(targets), np.inf)
+        slope = self.inverse.slope(asked)
+        best, there, least = asked, np.full(targets.shape, np.nan), np.full(len(targets), np.inf)
         for k in range(self.tries):
-            landings = np.asarray(self.land(asked))
+            landings = np.asarray(self.land(asked), dtype=np.float64)
             self.simulator_calls += len(asked)
             error = np.linalg.norm(landings - targets, axis=1)
-            error[~np.isfinite(error)] = np.inf
-            better = error < least
-            best[better], least[better] = asked[better], error[better]
-            if k + 1 == self.tries:
-                break
-            for i in np.flatnonzero(np.isfinite(error)):
-                planners[i] = planners[i].told(asked[i : i + 1], landings[i : i + 1])
-            following = [planner.plan(target[None]).stretches[0] for planner, target in zip(planners, targets, strict=True)]
-            asked = np.stack(following)
+            flew, known = np.isfinite(error), np.isfinite(least)
+            slope = np.where((flew & known)[:, None, None], _updated(slope, asked - best, landings - there), slope)
+            better = flew & (error < least)
+            best, there = np.where(better[:, None], asked, best), np.where(better[:, None], landings, there)
+            least = np.where(better, error, least)
+            if k + 1 < self.tries:
+                step = _step(best, slope, np.nan_to_num(targets - there))
+                # after a failed hop: half the way back to the best, or to the middle of the range where there is none
+                back = 0.5 * (asked + np.where(np.isfinite(least)[:, None], best, sum(STRETCH_RANGE) / 2))
+                asked = np.where(flew[:, None], np.clip(best + step, *STRETCH_RANGE), back)
         return (best[0] if np.ndim(observation) == 1 else best), state
+
+
+def _updated(slope: Floats, moved: Floats, came: Floats) -> Floats:
+    """Slopes (n, 2, n_actuators) that agree with the last move (n, n_actuators) and what came of it (n, 2) [m]."""
+    missed = np.nan_to_num(came - (slope @ moved[..., None])[..., 0])
+    square = (moved**2).sum(axis=1) + SCATTER_STEP**2
+    return slope + missed[..., None] * moved[:, None] / square[:, None, None]
+
+
+def _step(at: Floats, slope: Floats, wanted: Floats) -> Floats:
+    """Least-norm steps (n, n_actuators) that move landings by ``wanted`` (n, 2) [m], where the range of stretches lets them.
+
+    Stretches at an end of their range that would leave it are held, and the others do their part.
+    """
+    low, high = STRETCH_RANGE
+    free = np.ones(at.shape, dtype=bool)
+    for _ in range(at.shape[1]):
+        step = (np.linalg.pinv(slope * free[:, None], rcond=1e-3) @ wanted[..., None])[..., 0]
+        leaving = free & (((at <= low) & (step < 0)) | ((at >= high) & (step > 0)))
+        if not leaving.any():
+            break
+        free &= ~leaving
+    longest = np.abs(step).max(axis=1, keepdims=True)
+    return step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))

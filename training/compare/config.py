@@ -33,14 +33,14 @@ class CompareConfig:
     its k-th tenth on. Small budgets of different seeds then share no hop, large ones share most."""
     budgets: tuple[int, ...] = (100, 1000, 10000)
     """Simulator calls that a method may learn from."""
-    seeds: int = 10
-    """Training seeds of the planners."""
+    seeds: tuple[int, ...] = (10,)
+    """Training seeds of the planners: one number, or one for each budget."""
     algorithms: tuple[str, ...] = ALGORITHMS
     """Policies to train."""
     policy_budgets: tuple[int, ...] | None = None
     """Budgets of the policies; None: the same."""
-    policy_seeds: int | None = None
-    """Training seeds of the policies; None: the same."""
+    policy_seeds: tuple[int, ...] | None = None
+    """Training seeds of the policies: one number, or one for each of their budgets; None: the same."""
     targets: int | None = None
     """Registered targets of each place (inside, boundary, beyond) to use; None: all."""
     perturbations: int = 8
@@ -77,12 +77,16 @@ class CompareConfig:
     """Show progress bars."""
 
     def __post_init__(self) -> None:
-        counts = {"seeds": self.seeds, "perturbations": self.perturbations, "updates": self.updates}
+        counts = {"seeds": min(self.seeds, default=0), "perturbations": self.perturbations, "updates": self.updates}
         for name, value in counts.items():
             if value < 1:
                 raise InvalidParameterError(f"{name}: expected an integer >= 1, got {value}")
         if not self.budgets or min(self.budgets) < 8:
             raise InvalidParameterError(f"budgets: expected numbers >= 8, got {self.budgets}")
+        each = {"seeds": (self.seeds, self.budgets), "policy_seeds": (self.seeds_of_policies, self.budgets_of_policies)}
+        for name, (numbers, budgets) in each.items():
+            if len(numbers) not in (1, len(budgets)):
+                raise InvalidParameterError(f"{name}: expected one number, or one for each of {budgets}, got {numbers}")
         strangers = sorted(set(self.algorithms) - set(ALGORITHMS))
         if strangers:
             raise InvalidParameterError(f"algorithms: expected some of {ALGORITHMS}, got {strangers}")
@@ -96,7 +100,9 @@ class CompareConfig:
             duration=0.06,
             data=None,
             budgets=(16, 32),
-            seeds=2,
+            seeds=(2,),
+            policy_seeds=None,
+            policy_budgets=None,
             algorithms=("sac",),
             targets=2,
             perturbations=2,
@@ -114,3 +120,23 @@ class CompareConfig:
     def budgets_of_policies(self) -> tuple[int, ...]:
         """Budgets of the policies."""
         return self.budgets if self.policy_budgets is None else self.policy_budgets
+
+    @property
+    def seeds_of_policies(self) -> tuple[int, ...]:
+        """Training seeds of the policies."""
+        return self.seeds if self.policy_seeds is None else self.policy_seeds
+
+    @property
+    def planner_runs(self) -> list[tuple[int, int]]:
+        """Seeds and budgets of the planners, in the order in which they run."""
+        return _runs(self.seeds, self.budgets)
+
+    @property
+    def policy_runs(self) -> list[tuple[int, int]]:
+        """Seeds and budgets of the policies, small budgets first."""
+        return sorted(_runs(self.seeds_of_policies, self.budgets_of_policies), key=lambda run: run[1])
+
+
+def _runs(seeds: tuple[int, ...], budgets: tuple[int, ...]) -> list[tuple[int, int]]:
+    each = dict(zip(budgets, seeds if len(seeds) > 1 else seeds * len(budgets), strict=True))
+    return [(seed, budget) for seed in range(max(seeds)) for budget in budgets if seed < each[budget]]

@@ -22,7 +22,6 @@ from training.compare.config import CompareConfig
 from training.compare.hops import Hops
 from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, save_net, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.kriging import Kriging
 from training.planner import BestOfPlanner, NearestHopPlanner, Planner
 from training.policies import ActorPolicy
 from training.refine import RefiningPlanner
@@ -56,18 +55,16 @@ class Comparison:
         """All stages, cheap ones first."""
         config = self.config
         self._floor()
-        for seed in range(config.seeds):
-            for budget in config.budgets:
-                self._planners(seed, budget)
-                if seed < (config.seeds if config.tries_seeds is None else config.tries_seeds):
-                    self._best_of(seed, budget)
-                if config.refine:
-                    self._refined(seed, budget)
+        for seed, budget in config.planner_runs:
+            self._planners(seed, budget)
+            if config.tries_seeds is None or seed < config.tries_seeds:
+                self._best_of(seed, budget)
+            if config.refine:
+                self._refined(seed, budget)
         self._oracle()
-        for seed in range(config.seeds if config.policy_seeds is None else config.policy_seeds):
-            for budget in config.budgets_of_policies:
-                for algorithm in config.algorithms:
-                    self._policy(algorithm, seed, budget)
+        for seed, budget in config.policy_runs:
+            for algorithm in config.algorithms:
+                self._policy(algorithm, seed, budget)
         if config.latencies:
             self._latency()
 
@@ -78,12 +75,18 @@ class Comparison:
         most = max(self.config.budgets)
         if self.config.data is not None:
             found = from_file(self.config.data, self.scene, seed, most)
-            self.stages.run(f"hops_{seed}", self.base | {"digest": found.digest}, lambda: {"seconds": found.seconds})
         else:
             found = dataset.concatenate([self._block(seed, k, most) for k in range(0, most, BLOCK)])
-            content = self.base | {"hops": len(found), "digest": found.digest}
-            self.stages.run(f"hops_{seed}", content, lambda: {"seconds": found.seconds})
         self._pools = {seed: found}  # one at a time in memory
+        return found
+
+    def learnt(self, seed: int, budget: int) -> HopData:
+        """The hops that planners of a seed and budget learn from, with a record of which they are."""
+        pool, name = self.pool(seed), f"hops_{seed}_{budget}"
+        found = pool.rows(slice(0, budget))
+        if name not in self.stages.hashes:
+            seconds = pool.seconds * budget / len(pool)
+            self.stages.run(name, self.base | {"digest": found.digest}, lambda: {"seconds": seconds})
         return found
 
     def _block(self, seed: int, first: int, most: int) -> HopData:
@@ -113,7 +116,7 @@ class Comparison:
     def fitted(self, seed: int, budget: int) -> Fitted:
         """Planners of a seed and budget."""
         if (seed, budget) not in self._fitted:
-            data = self.pool(seed).rows(slice(0, budget))
+            data = self.learnt(seed, budget)
             net, _ = model.load(self.stages.folder / f"net_{seed}_{budget}.safetensors")
             self._fitted = {(seed, budget): Fitted(net, data, self.config, seed, self.floor)}
         return self._fitted[seed, budget]
@@ -121,7 +124,7 @@ class Comparison:
     def _planners(self, seed: int, budget: int) -> None:
         config, tag = self.config, f"{seed}_{budget}"
         path = self.stages.folder / f"net_{tag}.safetensors"
-        data = self.pool(seed).rows(slice(0, budget))
+        data = self.learnt(seed, budget)
 
         def learn() -> Results:
             net, seconds = fit_net(data, config, seed)
@@ -129,7 +132,7 @@ class Comparison:
             return {"seconds": seconds}
 
         settings = {"surrogate": asdict(config.surrogate), "updates": config.updates}
-        self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{seed}"], files=[path.name])
+        self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{tag}"], files=[path.name])
 
         def plan() -> Results:
             fitted = self.fitted(seed, budget)
@@ -173,31 +176,28 @@ class Comparison:
         tag, tries = f"{seed}_{budget}", self.config.refine
 
         def work() -> Results:
-            inverse = self.fitted(seed, budget).inverse
-            if not isinstance(inverse.correction, Kriging):  # too few hops to tell how rough the map is
-                return {"stretches": None}
-            return {"stretches": RefiningPlanner(inverse, self.hops.land, tries).predict(self.targets)[0].tolist()}
+            planner = RefiningPlanner(self.fitted(seed, budget).inverse, self.hops.land, tries)
+            return {"stretches": planner.predict(self.targets)[0].tolist()}
 
-        if self.stages.run(f"refine_{tag}", {"tries": tries}, work, needs=[f"plans_{tag}"])["stretches"] is not None:
-            self._score(f"refine{tries}", seed, budget, f"refine_{tag}", lambda: self.stages.results[f"refine_{tag}"])
+        self.stages.run(f"refine_{tag}", {"tries": tries, "method": "secant"}, work, needs=[f"plans_{tag}"])
+        self._score(f"refine{tries}", seed, budget, f"refine_{tag}", lambda: self.stages.results[f"refine_{tag}"])
 
     def _oracle(self) -> None:
         if not self.config.oracle or not find_spec("cma"):
             return
 
+        budget = max(self.config.budgets)
+        data = self.learnt(0, budget)
+
         def work() -> Results:
-            planner = self._evolution()
+            start = NearestHopPlanner(data["stretches"][data.usable], data["landing"][data.usable])
+            planner = EvolutionPlanner(self.hops.land, start, self._search)
             stretches, _ = planner.predict(self.targets)
             return {"stretches": stretches.tolist(), "calls_per_answer": planner.calls / len(self.targets)}
 
-        settings = {"search": asdict(self._search), "targets": self.targets.tolist(), "budget": max(self.config.budgets)}
-        self.stages.run("oracle", settings, work, needs=["hops_0"])
-        self._score("oracle", 0, max(self.config.budgets), "oracle", lambda: self.stages.results["oracle"])
-
-    def _evolution(self) -> EvolutionPlanner:
-        data = self.pool(0)
-        start = NearestHopPlanner(data["stretches"][data.usable], data["landing"][data.usable])
-        return EvolutionPlanner(self.hops.land, start, self._search)
+        settings = {"search": asdict(self._search), "targets": self.targets.tolist()}
+        self.stages.run("oracle", settings, work, needs=[f"hops_0_{budget}"])
+        self._score("oracle", 0, budget, "oracle", lambda: self.stages.results["oracle"])
 
     @property
     def _search(self) -> EvolutionConfig:
@@ -246,7 +246,7 @@ class Comparison:
             fitted = self.fitted(0, budget)
             asked: dict[str, Planner] = {name: fitted[name] for name in self.names}
             asked |= {f"best{t}": BestOfPlanner(fitted.inverse, self.hops.land, t) for t in self.config.tries}
-            if self.config.refine and isinstance(fitted.inverse.correction, Kriging):
+            if self.config.refine:
                 asked[f"refine{self.config.refine}"] = RefiningPlanner(fitted.inverse, self.hops.land, self.config.refine)
             asked |= {a: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for a, name in policies.items()}
             return {name: self._questions(planner, name) for name, planner in asked.items()}
