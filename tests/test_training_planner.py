@@ -21,6 +21,7 @@ from training.kriging import fit_kriging
 from training.planner import BestOfPlanner, NearestHopPlanner, targets_of
 from training.policies import ActorPolicy, _mlp
 from training.refine import RefiningPlanner
+from training.similarity import Scaling
 from training.tandem import TandemConfig, TandemPlanner
 
 
@@ -195,7 +196,7 @@ def test_targets_that_are_none_are_named(bad: np.ndarray) -> None:
 
 def test_actor_round_trip_and_refusals(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    actor = ActorPolicy(_mlp([2, 8, 4]), scale=0.5)
+    actor = ActorPolicy(_mlp([2, 8, 4]), Scaling((0.5,)))
     targets = np.random.default_rng(0).normal(size=(20, 2))
     path = actor.save(tmp_path / "actor.safetensors", {"seed": 0})
     assert np.array_equal(ActorPolicy.load(path).predict(targets)[0], actor.predict(targets)[0])

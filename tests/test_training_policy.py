@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -12,13 +13,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.scene_ranges import scene_ranges
+from tensegrity_gym.task import reach
 from training import train_policy as module
 from training.algorithms import hyperparameters
 from training.planner import NearestHopPlanner
 from training.sb3_vec_env import BatchedHopVecEnv, make_env
+from training.similarity import Scaling
 from training.train_policy import PolicyConfig, train_policy
 
 QUICK = Scene(duration=0.05)
+VARIED = scene_ranges({"gravity": (1.6, 9.81), "friction": (0.3, 0.8), "duration": 0.05})
 SMALL = PolicyConfig(calls=24, updates=1, envs=3, checkpoint_every=6)
 
 
@@ -32,16 +37,20 @@ def test_spends_its_budget_exactly_and_keeps_snapshots(algorithm: str, monkeypat
     assert sorted(actors) == [4, 8]
     # the copy answers as stable-baselines3 does, rescaled from [-1, 1] to stretches
     targets = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
-    theirs, _ = seen["model"].predict(targets / np.float32(actors[8].scale), deterministic=True)
+    theirs, _ = seen["model"].predict(actors[8].scaling(targets), deterministic=True)
     np.testing.assert_allclose(actors[8].predict(targets)[0], 0.5 + 0.3 * theirs, atol=1e-6)
     if algorithm != "ppo":  # its one rollout of 8 hops is not yet over at 4
         assert not np.allclose(actors[4].predict(targets)[0], actors[8].predict(targets)[0])
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "td3", "ppo"])
-def test_killed_training_goes_on_with_the_same_bits(algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("algorithm", "scene"), [("sac", QUICK), ("td3", QUICK), ("ppo", QUICK), ("sac", VARIED)], ids=["sac", "td3", "ppo", "varied"]
+)
+def test_killed_training_goes_on_with_the_same_bits(
+    algorithm: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = PolicyConfig(**{**vars(SMALL), "algorithm": algorithm, "calls": 96 if algorithm == "ppo" else 24})
-    whole, _ = train_policy(QUICK, config, progress=False)
+    whole, _ = train_policy(scene, config, progress=False)
     state = tmp_path / "policy.training"
     step = module._Watch._on_step
 
@@ -53,12 +62,12 @@ def test_killed_training_goes_on_with_the_same_bits(algorithm: str, tmp_path: Pa
     with monkeypatch.context() as patch:
         patch.setattr(module._Watch, "_on_step", killed)
         with pytest.raises(KeyboardInterrupt):
-            train_policy(QUICK, config, progress=False, state=state)
+            train_policy(scene, config, progress=False, state=state)
     assert state.exists()
     torch.manual_seed(99)
     with pytest.raises(DataFileError, match="settings"):
-        train_policy(QUICK, PolicyConfig(**{**vars(config), "seed": 5}), progress=False, state=state)
-    resumed, card = train_policy(QUICK, config, progress=False, state=state)
+        train_policy(scene, PolicyConfig(**{**vars(config), "seed": 5}), progress=False, state=state)
+    resumed, card = train_policy(scene, config, progress=False, state=state)
     assert card["simulator_calls"] == config.calls
     for name, values in whole[config.calls].layers.state_dict().items():
         assert torch.equal(values, resumed[config.calls].layers.state_dict()[name])
@@ -134,3 +143,42 @@ def test_batched_envs_give_what_the_registered_env_gives_one_after_the_other() -
 def test_budgets_beyond_the_calls_are_refused() -> None:
     with pytest.raises(InvalidParameterError, match="budgets"):
         train_policy(QUICK, PolicyConfig(calls=8), budgets=[9], progress=False)
+
+
+def test_policies_see_the_scene_that_all_envs_of_a_step_share() -> None:
+    scaling = Scaling.of(VARIED)
+    batched = BatchedHopVecEnv(VARIED, scaling, 3)
+    registered = gym.make_vec("TensegrityHop-v0", num_envs=3, scene=VARIED, shared_scene=True)
+    batched.seed(5)
+    seen, (observed, _) = batched.reset(), registered.reset(seed=5)
+    for action in (np.linspace(-1, 1, 12), np.linspace(0.5, -1, 12)):
+        assert len(np.unique(observed[:, 2:], axis=0)) == 1
+        np.testing.assert_array_equal(seen, scaling(observed))
+        box = batched.observation_space
+        assert isinstance(box, gym.spaces.Box)
+        assert (seen >= box.low).all()
+        assert (seen <= box.high).all()
+        actions = action.reshape(3, 4).astype(np.float32)
+        seen, rewards, _, infos = batched.step(actions)
+        stretches = np.stack([env.action(a) for env, a in zip(batched.envs, actions, strict=True)])  # type: ignore[attr-defined]
+        observed, theirs, _, _, told = registered.step(stretches)
+        np.testing.assert_allclose(rewards, theirs, rtol=1e-6)
+        ends = np.stack([info["landing"] for info in infos])
+        np.testing.assert_array_equal(ends, np.stack(told["final_info"]["landing"]))
+    batched.close()
+
+
+def test_scaled_observations_are_of_order_one_and_mean_what_they_say() -> None:
+    scaling = Scaling.of(VARIED)
+    rng = np.random.default_rng(0)
+    episodes = [VARIED.sample(rng) for _ in range(200)]
+    at_reach = np.array([(reach(s), 0.0, s.gravity, s.friction) for s in episodes], dtype=np.float32)
+    seen = scaling(at_reach)
+    np.testing.assert_allclose(seen[:, 2], (at_reach[:, 2] - 5.705) / 4.105, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 3], (at_reach[:, 3] - 0.55) / 0.25, atol=1e-6)
+    # reaches differ manifold between these scenes; made alike, by a quarter
+    assert np.ptp(np.log(at_reach[:, 0])) > np.log(5)
+    assert 0.75 < seen[:, 0].min() < seen[:, 0].max() < 1.25
+    products = at_reach[:, 0] * at_reach[:, 2]
+    np.testing.assert_allclose(seen[:, 0] / seen[0, 0], products / products[0], rtol=1e-5)
+    assert Scaling.of(scene_ranges("earth")) == Scaling((reach(Scene()),))

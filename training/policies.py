@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from surrogate.storage import atomic_path, ensure_folder, read_json, write_json
 from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training.planner import Prediction
+from training.similarity import Scaling
 
-FORMAT = "tensegrity_gym.actor/2"
+FORMAT = "tensegrity_gym.actor/3"
 
 
 #: How an actor's outputs are brought into [-1, 1].
@@ -27,15 +29,15 @@ SQUASHES = {"tanh": torch.tanh, "clip": lambda x: torch.clamp(x, -1, 1)}
 
 
 class ActorPolicy:
-    """Deterministic actor: observation / ``scale`` through a ReLU MLP, into [-1, 1], then onto the range of stretches."""
+    """Deterministic actor: scaled observation through a ReLU MLP, into [-1, 1], then onto the range of stretches."""
 
-    def __init__(self, layers: nn.Sequential, scale: float, squash: str = "tanh") -> None:
+    def __init__(self, layers: nn.Sequential, scaling: Scaling, squash: str = "tanh") -> None:
         self.layers = layers.eval()
-        self.scale, self.squash = float(scale), squash
+        self.scaling, self.squash = scaling, squash
 
     @classmethod
-    def from_model(cls, model: Any, scale: float) -> ActorPolicy:
-        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on observations / ``scale``."""
+    def from_model(cls, model: Any, scaling: Scaling) -> ActorPolicy:
+        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on observations of that ``scaling``."""
         policy = model.policy
         if hasattr(policy, "mlp_extractor"):  # PPO's mean action is cut off, not squashed
             modules, squash = [*policy.mlp_extractor.policy_net, policy.action_net], "clip"
@@ -47,7 +49,7 @@ class ActorPolicy:
         copy = _mlp([found[0].in_features, *(layer.out_features for layer in found)])
         for mine, theirs in zip(list(copy)[::2], found, strict=True):
             mine.load_state_dict(theirs.state_dict())
-        return cls(copy, scale, squash)
+        return cls(copy, scaling, squash)
 
     @torch.no_grad()
     def predict(
@@ -59,7 +61,7 @@ class ActorPolicy:
         if batch.ndim != 2 or batch.shape[1] != width or not np.isfinite(batch).all():
             raise InvalidParameterError(f"observation: expected finite numbers ({width},) or (n, {width}), got {observation!r}")
         low, high = STRETCH_RANGE
-        action = SQUASHES[self.squash](self.layers(torch.from_numpy(batch / np.float32(self.scale))))
+        action = SQUASHES[self.squash](self.layers(torch.from_numpy(self.scaling(batch))))
         share = (action.numpy().astype(np.float64) + 1) / 2
         stretches = np.clip(low + (high - low) * share, low, high)
         return (stretches[0] if np.ndim(observation) == 1 else stretches), state
@@ -74,7 +76,7 @@ class ActorPolicy:
         fixed = {
             "format": FORMAT,
             "model_version": MODEL_VERSION,
-            "scale": self.scale,
+            "scaling": asdict(self.scaling),
             "squash": self.squash,
             "sha256": hashlib.sha256(content).hexdigest(),
         }
@@ -100,7 +102,8 @@ class ActorPolicy:
             layers.load_state_dict(state)
             if card["squash"] not in SQUASHES:
                 raise ValueError(f"its card says squash {card['squash']!r}")
-            return cls(layers, card["scale"], card["squash"])
+            kept = card["scaling"]
+            return cls(layers, Scaling(tuple(kept["scale"]), tuple(kept["offset"]), kept["gravity"]), card["squash"])
         except (OSError, ValueError, KeyError, IndexError, TypeError, RuntimeError, SafetensorError) as error:
             raise DataFileError(f"{path}: expected a whole actor checkpoint ({error}); train it again") from error
 

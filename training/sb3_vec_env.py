@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -12,22 +12,36 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tensegrity_gym
 from tensegrity_gym import Scene, simulate, task
+from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import HopStatus
+from training.similarity import Scaling
 
 
 class ScaledObservation(gym.ObservationWrapper):
     """Observations over a fixed scale, so that the nets see numbers of order one."""
 
-    def __init__(self, env: gym.Env, scale: float) -> None:
+    def __init__(self, env: gym.Env, scale: float | Scaling) -> None:
         super().__init__(env)
-        self.scale = np.float32(scale)
+        self.scaling = scale if isinstance(scale, Scaling) else Scaling((scale,))
         box = env.observation_space
         assert isinstance(box, gym.spaces.Box)
-        self.observation_space = gym.spaces.Box(box.low / self.scale, box.high / self.scale, dtype=np.float32)
+        self.observation_space = gym.spaces.Box(*self.scaling.bounds(box.low, box.high), dtype=np.float32)
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
         """Scaled observation, shape as it came."""
-        return observation / self.scale
+        return self.scaling(observation)
+
+
+class SharedScene(gym.Wrapper):
+    """Draws targets of its own, in the scene that another env has drawn."""
+
+    def __init__(self, env: gym.Env, leader: gym.Env) -> None:
+        super().__init__(env)
+        self.leader = leader
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """As the env's; the leader must have been reset before."""
+        return self.env.reset(seed=seed, options={**(options or {}), "scene": self.leader.unwrapped.scene})  # type: ignore[attr-defined]
 
 
 class ScaledAction(gym.ActionWrapper):
@@ -46,23 +60,33 @@ class ScaledAction(gym.ActionWrapper):
         return np.clip(low + (high - low) * (action + 1) / 2, low, high)
 
 
-def make_env(scene: Scene, scale: float) -> ScaledAction:
-    """The registered env with observations over ``scale`` [m] and actions rescaled to [-1, 1], as policies want them."""
-    return ScaledAction(ScaledObservation(gym.make("TensegrityHop-v0", scene=scene), scale))
+def make_env(scene: Scene | SceneRanges, scale: float | Scaling, leader: gym.Env | None = None) -> ScaledAction:
+    """The registered env with observations over ``scale`` [m] and actions rescaled to [-1, 1], as policies want them.
+
+    With a ``leader`` its scenes are those that the leader drew.
+    """
+    env: gym.Env = gym.make("TensegrityHop-v0", scene=scene)
+    return ScaledAction(ScaledObservation(env if leader is None else SharedScene(env, leader), scale))
 
 
 class BatchedHopVecEnv(DummyVecEnv):
-    """``envs`` of :func:`make_env` in one scene; gives what DummyVecEnv gives, bit by bit.
+    """``envs`` of :func:`make_env`; gives what DummyVecEnv gives, bit by bit.
 
     Targets, seeds, spaces and observations are the envs' own, rewards come from the same function that they call; only
-    ``simulate`` is called once for all of them. Infos hold ``landing`` (2,) [m], ``error`` [m] and ``status``.
+    ``simulate`` is called once for all of them. Where scenes vary, the first env draws one for all at each reset, as the
+    registered vector env does with ``shared_scene``. Infos hold ``landing`` (2,) [m], ``error`` [m] and ``status``.
     ``levers``: further arguments of ``simulate``.
     """
 
-    def __init__(self, scene: Scene, scale: float, envs: int, levers: Mapping[str, Any] | None = None) -> None:
-        makers: Sequence[Callable[[], gym.Env]] = [lambda: make_env(scene, scale)] * envs
-        super().__init__(list(makers))
-        self.scene, self.levers = scene, dict(levers or {})
+    def __init__(
+        self, scene: Scene | SceneRanges, scale: float | Scaling, envs: int, levers: Mapping[str, Any] | None = None
+    ) -> None:
+        first = make_env(scene, scale)
+        varied = isinstance(scene, SceneRanges) and bool(scene.ranges)
+        makers: list[Callable[[], gym.Env]] = [lambda: first]
+        makers += [lambda: make_env(scene, scale, first if varied else None)] * (envs - 1)
+        super().__init__(makers)
+        self.levers = dict(levers or {})
         #: Hops simulated since the envs were made.
         self.simulator_calls = 0
         #: Wall time that simulating them took [s].
@@ -74,11 +98,12 @@ class BatchedHopVecEnv(DummyVecEnv):
         low, high = tensegrity_gym.STRETCH_RANGE  # float32 cannot hold them: cut the overshoot off, as the env does
         stretches = np.stack([env.action(action) for env, action in zip(plain, self.actions, strict=True)]).astype(np.float64)
         started = time.perf_counter()
-        hop = simulate(np.clip(stretches, low, high), scene=self.scene, **self.levers)
+        scene = plain[0].unwrapped.scene
+        hop = simulate(np.clip(stretches, low, high), scene=scene, **self.levers)
         self.seconds += time.perf_counter() - started
         self.simulator_calls += len(stretches)
         targets = np.stack([info["target"] for info in self.reset_infos])
-        rewards = task.reward(hop.landing, targets, hop.status, task.reach(self.scene))
+        rewards = task.reward(hop.landing, targets, hop.status, task.reach(scene))
         errors = task.landing_error(hop.landing, targets)
         observations = self.buf_obs[None].copy()  # type: ignore[index]
         outcomes = [

@@ -19,11 +19,13 @@ from surrogate.model import one_thread
 from surrogate.storage import hash_of
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.task import check_fidelity, reach
+from tensegrity_gym.scene_ranges import SceneRanges
+from tensegrity_gym.task import check_fidelity
 from training import checkpoint
 from training.algorithms import build, env_count, hyperparameters
 from training.policies import ActorPolicy
 from training.sb3_vec_env import BatchedHopVecEnv
+from training.similarity import Scaling
 
 #: Added to the seed of the envs that a policy is evaluated in while it trains.
 EVALUATION_SEED = 2_000_003
@@ -76,9 +78,11 @@ class PolicyCommand(PolicyConfig):
 class _Watch(BaseCallback):
     """Moves the progress bar, copies the actor whenever a budget of simulator calls is spent, and writes checkpoints."""
 
-    def __init__(self, config: PolicyConfig, budgets: Sequence[int], scale: float, bar: tqdm, path: Path | None, settings: str):
+    def __init__(
+        self, config: PolicyConfig, budgets: Sequence[int], scaling: Scaling, bar: tqdm, path: Path | None, settings: str
+    ):
         super().__init__()
-        self.config, self.budgets, self.scale, self.bar = config, sorted(budgets), scale, bar
+        self.config, self.budgets, self.scaling, self.bar = config, sorted(budgets), scaling, bar
         self.path, self.settings, self.written = path, settings, 0
         self.snapshots: dict[int, ActorPolicy] = {}
 
@@ -101,20 +105,20 @@ class _Watch(BaseCallback):
         """Copy the actor if a budget is spent that has no copy yet."""
         for budget in self.budgets:
             if self.model.num_timesteps >= budget and budget not in self.snapshots:
-                self.snapshots[budget] = ActorPolicy.from_model(self.model, self.scale)
+                self.snapshots[budget] = ActorPolicy.from_model(self.model, self.scaling)
 
     def resume(self, model: Any, actors: dict[int, Any]) -> None:
         """Go on with the actors of a checkpoint."""
         self.written = model.num_timesteps
         self.bar.update(model.num_timesteps)
         for budget, weights in actors.items():
-            self.snapshots[budget] = ActorPolicy.from_model(model, self.scale)
+            self.snapshots[budget] = ActorPolicy.from_model(model, self.scaling)
             self.snapshots[budget].layers.load_state_dict(weights)
 
 
 @one_thread()
 def train_policy(
-    scene: Scene,
+    scene: Scene | SceneRanges,
     config: PolicyConfig,
     *,
     budgets: Sequence[int] = (),
@@ -132,27 +136,28 @@ def train_policy(
             f"calls and budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}"
         )
     started = time.perf_counter()
-    scale, envs = reach(scene), config.together
+    scenes = scene if isinstance(scene, SceneRanges) else SceneRanges(scene)
+    scaling, envs = Scaling.of(scenes), config.together
     values = hyperparameters(config.algorithm, config.hyperparameters)
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
     plain = asdict(config) | {"hyperparameters": values}
     settings = hash_of({"config": plain, "scene": asdict(scene), "budgets": sorted(budgets)})
     with contextlib.ExitStack() as stack:
-        hops = BatchedHopVecEnv(scene, scale, envs, check_fidelity(config.fidelity))
+        hops = BatchedHopVecEnv(scene, scaling, envs, check_fidelity(config.fidelity))
         venv = stack.enter_context(contextlib.closing(VecMonitor(hops)))
         bar = stack.enter_context(
             tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
         )
         model = build(config.algorithm, values, venv, config.calls, config.seed, tensorboard)
-        watch = _Watch(config, [*budgets, config.calls], scale, bar, state, settings)
+        watch = _Watch(config, [*budgets, config.calls], scaling, bar, state, settings)
         before = 0
         if state is not None and state.exists():
             watch.resume(model, checkpoint.restore(state, model, venv, settings))
             before = model.num_timesteps
         callbacks: list[BaseCallback] = [watch]
         if config.evaluate_every:
-            callbacks.append(_evaluation(stack, scene, scale, config))
+            callbacks.append(_evaluation(stack, scene, scaling, config))
         model.learn(config.calls - before, callback=CallbackList(callbacks), reset_num_timesteps=before == 0)
         watch.keep()
         calls = before + hops.simulator_calls
@@ -162,8 +167,8 @@ def train_policy(
     return watch.snapshots, card | {"seconds": time.perf_counter() - started, "simulating_seconds": hops.seconds}
 
 
-def _evaluation(stack: contextlib.ExitStack, scene: Scene, scale: float, config: PolicyConfig) -> EvalCallback:
-    venv = BatchedHopVecEnv(scene, scale, 16, check_fidelity(config.fidelity))
+def _evaluation(stack: contextlib.ExitStack, scene: Scene | SceneRanges, scaling: Scaling, config: PolicyConfig) -> EvalCallback:
+    venv = BatchedHopVecEnv(scene, scaling, 16, check_fidelity(config.fidelity))
     venv.seed(config.seed + EVALUATION_SEED)
     monitored = stack.enter_context(contextlib.closing(VecMonitor(venv)))
     every = max(1, config.evaluate_every // config.together)
