@@ -226,6 +226,25 @@ def test_frozen_net_lands_where_the_net_does() -> None:
         torch.testing.assert_close(FrozenLanding(net)(stretches), net.landing(stretches), rtol=0, atol=1e-6)
 
 
+def test_frozen_net_of_varied_scenes_lands_where_the_net_does_and_refuses_others() -> None:
+    torch.manual_seed(0)
+    ranges = {"gravity": (1.6, 9.81), "friction": (0.3, 0.8)}
+    net = HopNet(NetConfig(hidden=(8, 8), members=2), *scene_symmetries(Lattice(2, 2), Scene()), Scene(), ranges).eval()
+    stretches = torch.from_numpy(sample_stretches(50, 1).astype(np.float32))
+    scenes = torch.rand(50, 2) * torch.tensor([8.0, 0.5]) + torch.tensor([1.7, 0.3])  # gravity, friction: the envs' order
+    landing = FrozenLanding(net, ("gravity", "friction"))
+    with torch.no_grad():
+        wanted = net.landing(stretches, scenes.flip(1))  # the net's own order is the alphabet's
+        torch.testing.assert_close(landing(stretches, scenes), wanted, rtol=0, atol=1e-6)
+        bound = landing.at(scenes[7].numpy())(stretches)
+        torch.testing.assert_close(bound[:, 7], wanted[:, 7], rtol=0, atol=1e-6)
+        torch.testing.assert_close(bound, net.landing(stretches, scenes[7].flip(0)), rtol=0, atol=1e-6)
+    with pytest.raises(InvalidParameterError, match="scene"):
+        landing(stretches)
+    with pytest.raises(InvalidParameterError, match="slope"):
+        FrozenLanding(HopNet(NetConfig(hidden=(8,)), *scene_symmetries(Lattice(2, 2), Scene()), Scene(), {"slope": (0.0, 0.1)}))
+
+
 def rough_data(net: HopNet, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stretches, landings that the net misses by waves of 5 mm, as equivariant as it is, and these residuals."""
     stretches = sample_stretches(count, seed)

@@ -37,21 +37,27 @@ def targets_of(observation: np.ndarray) -> np.ndarray:
 
 
 class NearestHopPlanner:
-    """Repeat the stored hop that landed nearest to the target: the baseline that every other planner must beat."""
+    """Repeat the stored hop that landed nearest to the target: the baseline that every other planner must beat.
 
-    def __init__(self, stretches: np.ndarray, landings: np.ndarray) -> None:
+    ``strangeness``: squared error to expect of each stored hop for its being of another scene, shape (m,) [m^2].
+    """
+
+    def __init__(self, stretches: np.ndarray, landings: np.ndarray, strangeness: np.ndarray | None = None) -> None:
         if len(stretches) == 0 or len(stretches) != len(landings):
             raise InvalidParameterError(
                 f"expected as many stretches as landings, at least one, got {len(stretches)} and {len(landings)}"
             )
         self.stretches = np.asarray(stretches, dtype=np.float64)
         self.landings = np.asarray(landings, dtype=np.float64)
+        self.strangeness = strangeness
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Prediction:
         """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4)."""
         distance = np.linalg.norm(targets_of(observation)[:, None] - self.landings, axis=2)
+        if self.strangeness is not None:
+            distance = distance**2 + self.strangeness
         chosen = self.stretches[distance.argmin(axis=1)]
         return (chosen[0] if np.ndim(observation) == 1 else chosen), state
 
