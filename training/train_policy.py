@@ -141,10 +141,10 @@ def train_policy(
     values = hyperparameters(config.algorithm, config.hyperparameters)
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
-    plain = asdict(config) | {"hyperparameters": values}
-    settings = hash_of({"config": plain, "scene": asdict(scene), "budgets": sorted(budgets)})
+    plain, told = asdict(config) | {"hyperparameters": values}, asdict(scenes if scenes.ranges else scenes.base)
+    settings = hash_of({"config": plain, "scene": told, "budgets": sorted(budgets)})
     with contextlib.ExitStack() as stack:
-        hops = BatchedHopVecEnv(scene, scaling, envs, check_fidelity(config.fidelity))
+        hops = BatchedHopVecEnv(scenes, scaling, envs, check_fidelity(config.fidelity))
         venv = stack.enter_context(contextlib.closing(VecMonitor(hops)))
         bar = stack.enter_context(
             tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
@@ -157,18 +157,18 @@ def train_policy(
             before = model.num_timesteps
         callbacks: list[BaseCallback] = [watch]
         if config.evaluate_every:
-            callbacks.append(_evaluation(stack, scene, scaling, config))
+            callbacks.append(_evaluation(stack, scenes, scaling, config))
         model.learn(config.calls - before, callback=CallbackList(callbacks), reset_num_timesteps=before == 0)
         watch.keep()
         calls = before + hops.simulator_calls
     if state is not None:
         state.unlink(missing_ok=True)
-    card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": asdict(scene), "simulator_calls": calls}
+    card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": told, "simulator_calls": calls}
     return watch.snapshots, card | {"seconds": time.perf_counter() - started, "simulating_seconds": hops.seconds}
 
 
-def _evaluation(stack: contextlib.ExitStack, scene: Scene | SceneRanges, scaling: Scaling, config: PolicyConfig) -> EvalCallback:
-    venv = BatchedHopVecEnv(scene, scaling, 16, check_fidelity(config.fidelity))
+def _evaluation(stack: contextlib.ExitStack, scenes: SceneRanges, scaling: Scaling, config: PolicyConfig) -> EvalCallback:
+    venv = BatchedHopVecEnv(scenes, scaling, 16, check_fidelity(config.fidelity))
     venv.seed(config.seed + EVALUATION_SEED)
     monitored = stack.enter_context(contextlib.closing(VecMonitor(venv)))
     every = max(1, config.evaluate_every // config.together)

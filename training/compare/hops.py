@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from tensegrity_gym import Equilibria, HopResult, Scene, simulate
+from tensegrity_gym.batch import thread_count
+from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
 
 #: Standard deviation by which each mass above the ground is moved at the start [m]: what nobody can know.
@@ -30,11 +33,11 @@ class Hops:
         self.calls += len(stretches)
         return simulate(stretches, scene=self.scene, equilibria=equilibria, threads=self.threads, **self.levers)
 
-    def land(self, stretches: Floats) -> Floats:
-        """Landings, shape (n, 2) [m]; not-a-number where a hop failed."""
+    def land(self, stretches: Floats, asked: Floats | None = None) -> Floats:
+        """Landings, shape (n, 2) [m]; not-a-number where a hop failed. What was ``asked`` makes no difference in one scene."""
         return _landings(self.simulate(stretches))
 
-    def perturbed(self, stretches: Floats, times: int) -> Floats:
+    def perturbed(self, stretches: Floats, times: int, asked: Floats | None = None) -> Floats:
         """Landings of the hops and of each ``times`` over from a moved start, shape (n, 1 + times, 2) [m]."""
         nominal = self.simulate(stretches)
         n, found = len(stretches), nominal.equilibria
@@ -45,6 +48,37 @@ class Hops:
         moved = replace(moved, positions=moved.positions + np.tile(noise, (n, 1, 1)) * above)
         others = _landings(self.simulate(np.repeat(stretches, times, axis=0), moved))
         return np.concatenate([_landings(nominal)[:, None], others.reshape(n, times, 2)], axis=1)
+
+
+class VariedHops:
+    """Hops in scenes that vary, counted: ``asked``, observations (n, 2 + k), say in which scene each hop is made."""
+
+    def __init__(self, scenes: SceneRanges, levers: Mapping[str, Any], threads: int | None = None) -> None:
+        self.scenes, self.levers, self.threads = scenes, dict(levers), threads
+        #: Hops simulated so far.
+        self.calls = 0
+
+    def at(self, values: Floats) -> Scene:
+        """The scene of values (k,) [SI]."""
+        return self.scenes.changed(self.scenes.base, dict(zip(self.scenes.observed, map(float, values), strict=True)))
+
+    def land(self, stretches: Floats, asked: Floats) -> Floats:
+        """Landings, shape (n, 2) [m]; not-a-number where a hop failed."""
+        return self._each(asked, lambda hops, rows: hops.land(stretches[rows]))
+
+    def perturbed(self, stretches: Floats, times: int, asked: Floats) -> Floats:
+        """Landings of the hops and of each ``times`` over from a moved start, shape (n, 1 + times, 2) [m]."""
+        return self._each(asked, lambda hops, rows: hops.perturbed(stretches[rows], times))
+
+    def _each(self, asked: Floats, work: Callable[[Hops, np.ndarray], Floats]) -> Floats:
+        """One batch for each scene that occurs, batches side by side; results in the order of ``asked``."""
+        distinct, which = np.unique(np.asarray(asked)[:, 2:], axis=0, return_inverse=True)
+        rows = [np.flatnonzero(which.reshape(-1) == k) for k in range(len(distinct))]
+        batches = [Hops(self.at(values), self.levers, threads=1) for values in distinct]
+        with ThreadPoolExecutor(thread_count(self.threads)) as pool:
+            parts = list(pool.map(work, batches, rows))
+        self.calls += sum(hops.calls for hops in batches)
+        return np.concatenate(parts)[np.argsort(np.concatenate(rows))]
 
 
 def _landings(result: HopResult) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +18,7 @@ from surrogate.model import HopNet
 from surrogate.train import train
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError
+from tensegrity_gym.scene_ranges import SceneRanges
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
 from training.evolution import EvolutionConfig, EvolutionPlanner
@@ -42,12 +43,16 @@ def simulated(hops: Hops, stretches: np.ndarray, seed: int) -> HopData:
     return dataset.from_result(result, configuration, time.perf_counter() - started)
 
 
-def from_file(path: Path, scene: Scene, seed: int, most: int) -> HopData:
-    """``most`` hops of a file, from its ``seed``-th tenth on, with their landing read where ``scene`` says."""
-    data = dataset.read(path)
-    kept = Scene(**data.configuration["scene"])
-    if replace(kept, landing=scene.landing, duration=scene.duration) != scene or data.configuration["scene_ranges"]:
-        raise DataFileError(f"{path}: expected hops in {scene}, got hops in {kept}; use another file, or none")
+def from_file(path: Path, scenes: SceneRanges, seed: int, most: int) -> HopData:
+    """``most`` hops of a file, from its ``seed``-th tenth on, with their landing read where the scenes say."""
+    data, scene = dataset.read(path), scenes.base
+    kept, ranges = Scene(**data.configuration["scene"]), data.configuration["scene_ranges"]
+    same = replace(kept, landing=scene.landing, duration=scene.duration, **{n: getattr(scene, n) for n in scenes.observed})
+    wanted = {name: list(bounds) for name, bounds in scenes.ranges.items()}
+    if same != scene or ranges != wanted or (wanted and kept.duration < scene.duration):
+        raise DataFileError(
+            f"{path}: expected hops in {scene}{_and(wanted)}, got hops in {kept}{_and(ranges)}; use another file, or none"
+        )
     if len(data) < most:
         raise DataFileError(f"{path}: expected at least {most} hops, got {len(data)}; generate more, or choose smaller budgets")
     rows = data.rows((np.arange(most) + seed * (len(data) // PARTS)) % len(data))
@@ -55,6 +60,10 @@ def from_file(path: Path, scene: Scene, seed: int, most: int) -> HopData:
     columns = rows.columns | {"landing": rows[scene.landing].copy()}
     seconds = float(columns["cpu_seconds"].sum()) if "cpu_seconds" in columns else data.seconds * most / len(data)
     return HopData(columns, configuration, seconds)
+
+
+def _and(ranges: Mapping[str, Sequence[float]]) -> str:
+    return "".join(f", {name} from {low:g} to {high:g}" for name, (low, high) in ranges.items())
 
 
 def fit_net(data: HopData, config: CompareConfig, seed: int) -> tuple[HopNet, float]:

@@ -8,15 +8,15 @@ from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
-from tensegrity_gym import Scene
-from tensegrity_gym.task import check_fidelity
+from surrogate.model import HopNet
+from tensegrity_gym.task import check_fidelity, reach
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
@@ -36,13 +36,18 @@ LATENCY_SEED = 5
 
 
 class Comparison:
-    """One scene and landing."""
+    """One scene and landing; see ``varied`` for scenes that vary."""
+
+    #: Settings of policies that differ from the usual ones.
+    policy_settings: ClassVar[dict[str, Any]] = {}
+    hops: Any
 
     def __init__(self, config: CompareConfig) -> None:
         self.config = config
         changes = {} if config.duration is None else {"duration": config.duration}
-        self.scene = Scene.preset(config.scene, landing=config.landing, **changes)
-        self.hops = Hops(self.scene, check_fidelity(config.fidelity), config.threads)
+        self.scenes = registered.scenes_of(config.scene, config.landing, **changes)
+        self.scene = self.scenes.base
+        self.hops = self._simulator()
         self.stages = Stages(Path(config.out), say=print if config.progress else lambda _: None)
         self.places = registered.read(config.scene, config.landing, config.targets)
         self.targets = np.concatenate(list(self.places.values()))
@@ -50,6 +55,14 @@ class Comparison:
         self.base = {"scene": asdict(self.scene), "fidelity": config.fidelity}
         self._fitted: dict[tuple[int, int], Fitted] = {}
         self._pools: dict[int, HopData] = {}
+
+    def _simulator(self) -> Any:
+        return Hops(self.scene, check_fidelity(self.config.fidelity), self.config.threads)
+
+    @property
+    def reaches(self) -> np.ndarray:
+        """Reach of the scene of each target, shape (n,) [m]."""
+        return np.full(len(self.targets), reach(self.scene))
 
     def run(self) -> None:
         """All stages, cheap ones first."""
@@ -74,7 +87,7 @@ class Comparison:
             return self._pools[seed]
         most = max(self.config.budgets)
         if self.config.data is not None:
-            found = from_file(self.config.data, self.scene, seed, most)
+            found = from_file(self.config.data, self.scenes, seed, most)
         else:
             found = dataset.concatenate([self._block(seed, k, most) for k in range(0, most, BLOCK)])
         self._pools = {seed: found}  # one at a time in memory
@@ -116,10 +129,12 @@ class Comparison:
     def fitted(self, seed: int, budget: int) -> Fitted:
         """Planners of a seed and budget."""
         if (seed, budget) not in self._fitted:
-            data = self.learnt(seed, budget)
             net, _ = model.load(self.stages.folder / f"net_{seed}_{budget}.safetensors")
-            self._fitted = {(seed, budget): Fitted(net, data, self.config, seed, self.floor)}
+            self._fitted = {(seed, budget): self._fit(net, self.learnt(seed, budget), seed)}
         return self._fitted[seed, budget]
+
+    def _fit(self, net: HopNet, data: HopData, seed: int) -> Any:
+        return Fitted(net, data, self.config, seed, self.floor)
 
     def _planners(self, seed: int, budget: int) -> None:
         config, tag = self.config, f"{seed}_{budget}"
@@ -160,8 +175,8 @@ class Comparison:
         def work() -> Results:
             most = max(self.config.tries)
             proposed = self.fitted(seed, budget).inverse.propose(self.targets, most)
-            landings = self.hops.land(proposed.reshape(-1, proposed.shape[2])).reshape(*proposed.shape[:2], 2)
-            errors = np.linalg.norm(landings - self.targets[:, None], axis=2)
+            landings = self.hops.land(proposed.reshape(-1, proposed.shape[2]), np.repeat(self.targets, most, axis=0))
+            errors = np.linalg.norm(landings.reshape(*proposed.shape[:2], 2) - self.targets[:, None, :2], axis=2)
             errors = np.where(np.isfinite(errors), errors, np.inf)
             return {
                 str(tries): {"stretches": proposed[np.arange(len(proposed)), errors[:, :tries].argmin(axis=1)].tolist()}
@@ -176,11 +191,17 @@ class Comparison:
         tag, tries = f"{seed}_{budget}", self.config.refine
 
         def work() -> Results:
-            planner = RefiningPlanner(self.fitted(seed, budget).inverse, self.hops.land, tries)
+            planner = self._refining(self.fitted(seed, budget), tries)
             return {"stretches": planner.predict(self.targets)[0].tolist()}
 
         self.stages.run(f"refine_{tag}", {"tries": tries, "method": "secant"}, work, needs=[f"plans_{tag}"])
         self._score(f"refine{tries}", seed, budget, f"refine_{tag}", lambda: self.stages.results[f"refine_{tag}"])
+
+    def _best(self, fitted: Any, tries: int) -> Planner:
+        return BestOfPlanner(fitted.inverse, self.hops.land, tries)
+
+    def _refining(self, fitted: Any, tries: int) -> Planner:
+        return RefiningPlanner(fitted.inverse, self.hops.land, tries)
 
     def _oracle(self) -> None:
         if not self.config.oracle or not find_spec("cma"):
@@ -190,14 +211,18 @@ class Comparison:
         data = self.learnt(0, budget)
 
         def work() -> Results:
-            start = NearestHopPlanner(data["stretches"][data.usable], data["landing"][data.usable])
-            planner = EvolutionPlanner(self.hops.land, start, self._search)
-            stretches, _ = planner.predict(self.targets)
-            return {"stretches": stretches.tolist(), "calls_per_answer": planner.calls / len(self.targets)}
+            before = self.hops.calls
+            stretches, _ = self._search_of(data).predict(self.targets)
+            return {"stretches": stretches.tolist(), "calls_per_answer": (self.hops.calls - before) / len(self.targets)}
 
         settings = {"search": asdict(self._search), "targets": self.targets.tolist()}
         self.stages.run("oracle", settings, work, needs=[f"hops_0_{budget}"])
         self._score("oracle", 0, budget, "oracle", lambda: self.stages.results["oracle"])
+
+    def _search_of(self, data: HopData) -> Planner:
+        """CMA-ES on the simulator, from the nearest of the hops in ``data``."""
+        start = NearestHopPlanner(data["stretches"][data.usable], data["landing"][data.usable])
+        return EvolutionPlanner(self.hops.land, start, self._search)
 
     @property
     def _search(self) -> EvolutionConfig:
@@ -209,11 +234,11 @@ class Comparison:
 
         name = f"policy_{algorithm}_{seed}_{budget}"
         path = self.stages.folder / f"{name}.safetensors"
-        settings = PolicyConfig(algorithm, calls=budget, seed=seed, fidelity=self.config.fidelity)
+        settings = PolicyConfig(algorithm, calls=budget, seed=seed, fidelity=self.config.fidelity, **self.policy_settings)
 
         def work() -> Results:
             state = path.with_suffix(".training")
-            actors, card = train_policy(self.scene, settings, progress=self.config.progress, state=state)
+            actors, card = train_policy(self.scenes, settings, progress=self.config.progress, state=state)
             actors[budget].save(path, card)
             return {
                 "seconds": card["seconds"],
@@ -232,7 +257,7 @@ class Comparison:
 
         def work() -> Results:
             stretches = np.array(answers()["stretches"])
-            landings = self.hops.perturbed(stretches, self.config.perturbations)
+            landings = self.hops.perturbed(stretches, self.config.perturbations, self.targets)
             return {"stretches": stretches.tolist(), "landings": landings.tolist()}
 
         content = self.base | {"perturbations": self.config.perturbations, "targets": self.targets.tolist()}
@@ -245,9 +270,9 @@ class Comparison:
         def work() -> Results:
             fitted = self.fitted(0, budget)
             asked: dict[str, Planner] = {name: fitted[name] for name in self.names}
-            asked |= {f"best{t}": BestOfPlanner(fitted.inverse, self.hops.land, t) for t in self.config.tries}
+            asked |= {f"best{t}": self._best(fitted, t) for t in self.config.tries}
             if self.config.refine:
-                asked[f"refine{self.config.refine}"] = RefiningPlanner(fitted.inverse, self.hops.land, self.config.refine)
+                asked[f"refine{self.config.refine}"] = self._refining(fitted, self.config.refine)
             asked |= {a: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for a, name in policies.items()}
             return {name: self._questions(planner, name) for name, planner in asked.items()}
 
@@ -269,6 +294,13 @@ class Comparison:
         return times[2:]
 
 
+def comparison_of(config: CompareConfig) -> Comparison:
+    """The comparison that a configuration asks for."""
+    from training.compare.varied import VariedComparison
+
+    return VariedComparison(config) if config.scene in registered.VARIED else Comparison(config)
+
+
 def main(config: CompareConfig) -> None:
     """Entry of ``python -m training compare``."""
     from training.compare import report
@@ -276,7 +308,7 @@ def main(config: CompareConfig) -> None:
 
     if config.quick:
         config = config.shortened()
-    comparison = Comparison(config)
+    comparison = comparison_of(config)
     comparison.run()
     outcome = Outcome(comparison)
     folder = comparison.stages.folder

@@ -1,0 +1,177 @@
+"""The comparison where scenes vary: each target has a scene of its own, which planners and policies see."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogate import dataset
+from surrogate.dataset import Configuration, HopData
+from surrogate.generate import fill, sample_stretches
+from surrogate.model import HopNet
+from tensegrity_gym.task import check_fidelity, reach
+from tensegrity_gym.types import Floats
+from training.compare.config import CompareConfig
+from training.compare.hops import VariedHops
+from training.compare.learn import mean_landing
+from training.compare.run import BLOCK, FLOOR_HOPS, Comparison
+from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.frozen import FrozenLanding
+from training.inverse import InversePlanner, fit_energy
+from training.planner import BestOfPlanner, Planner
+from training.refine import RefiningPlanner
+from training.similarity import alike_data, likeness
+from training.stages import Results
+from training.tandem import TandemPlanner
+from training.varied import NearestVariedHops, ScaledScenes, VariedPlanner
+
+
+class VariedComparison(Comparison):
+    """As the comparison of one scene; what is learnt is lengths as they would be on Earth."""
+
+    #: All envs of a step share a scene, as every 16 hops of a data set do; more envs would see fewer scenes.
+    policy_settings: ClassVar[dict[str, Any]] = {"envs": 16}
+
+    def __init__(self, config: CompareConfig) -> None:
+        super().__init__(config)
+        self.base |= {"ranges": {name: list(bounds) for name, bounds in self.scenes.ranges.items()}}
+
+    def _simulator(self) -> VariedHops:
+        return VariedHops(self.scenes, check_fidelity(self.config.fidelity), self.config.threads)
+
+    @property
+    def reaches(self) -> np.ndarray:
+        """Reach of the scene of each target, shape (n,) [m]."""
+        return self._reaches(self.targets)
+
+    def _reaches(self, observations: Floats) -> Floats:
+        return np.array([reach(self.hops.at(values)) for values in observations[:, 2:]])
+
+    def learnt(self, seed: int, budget: int) -> HopData:
+        """The hops that planners learn from, with lengths as they would be on Earth."""
+        return alike_data(super().learnt(seed, budget), self.scenes)
+
+    def _block(self, seed: int, first: int, most: int) -> HopData:
+        last = min(first + BLOCK, most)
+        path = self.stages.folder / f"hops_{seed}_{first}_{last}.h5"
+        configuration = Configuration(
+            scene=self.scene, seed=seed, fidelity=self.config.fidelity, scene_ranges=dict(self.scenes.ranges)
+        )
+
+        def work() -> Results:
+            fill(path, last - first, configuration, first=first, threads=self.config.threads, progress=False)
+            return {"seconds": dataset.read(path).seconds}
+
+        self.stages.run(path.stem, self.base | {"seed": seed, "first": first, "last": last}, work, files=[path.name])
+        return dataset.read(path)
+
+    def _floor(self) -> None:
+        def work() -> Results:
+            rng = np.random.default_rng(99)
+            drawn = [self.scenes.sample(rng) for _ in range(FLOOR_HOPS)]
+            values = np.array([[getattr(scene, name) for name in self.scenes.observed] for scene in drawn])
+            asked = np.column_stack([np.zeros((FLOOR_HOPS, 2)), values])
+            landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations, asked)
+            distances = np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2)
+            return {"distances": distances.tolist(), "reaches": self._reaches(asked).tolist()}
+
+        self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, work)
+
+    def _fit(self, net: HopNet, data: HopData, seed: int) -> VariedFitted:
+        return VariedFitted(net, data, self.config, seed, self)
+
+    def land(self, values: Floats) -> Callable[[Floats], Floats]:
+        """Landings as they would be on Earth [m], in the scene of ``values`` (k,) [SI], of stretches (n, n_actuators)."""
+        asked = np.concatenate([[0.0, 0.0], values])[None]
+        factor = likeness(values[None], self.scenes.observed)[0]
+        return lambda stretches: factor * self.hops.land(stretches, np.repeat(asked, len(stretches), axis=0))
+
+    def _best(self, fitted: VariedFitted, tries: int) -> Planner:
+        return VariedPlanner(lambda values: BestOfPlanner(fitted.planner(values), self.land(values), tries), self.scenes)
+
+    def _refining(self, fitted: VariedFitted, tries: int) -> Planner:
+        return VariedPlanner(lambda values: RefiningPlanner(fitted.planner(values), self.land(values), tries), self.scenes)
+
+    def _search_of(self, data: HopData) -> Planner:
+        hops = stored(data.rows(data.usable), self)
+        return VariedPlanner(lambda values: EvolutionPlanner(self.land(values), hops.at(values), self._search), self.scenes)
+
+
+def stored(data: HopData, comparison: VariedComparison) -> NearestVariedHops:
+    """The hops of ``data``, to be repeated in other scenes."""
+    scenes = comparison.scenes
+    values = np.column_stack([data[f"scene_{name}"] for name in scenes.observed])
+    return NearestVariedHops(data["stretches"], data["landing"], values, scenes)
+
+
+class VariedFitted:
+    """As ``Fitted``: planners of scenes that vary, made, when they are asked for, from hops and the net trained on them."""
+
+    def __init__(self, net: HopNet, data: HopData, config: CompareConfig, seed: int, comparison: VariedComparison) -> None:
+        self.net, self.data, self.config, self.seed = net, data.rows(data.usable), config, seed
+        self.comparison, self.scenes = comparison, comparison.scenes
+        self.landing = FrozenLanding(net, self.scenes.observed)
+        self.energy = fit_energy(self.data["stretches"], self.data["stored_energy"])
+        #: What making each planner took beyond simulating and the surrogate [s].
+        self.seconds: dict[str, float] = {}
+        self._made: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._made:
+            started = time.perf_counter()
+            make: dict[str, Callable[[], Planner]] = {
+                "nearest": lambda: VariedPlanner(stored(self.data, self.comparison).at, self.scenes),
+                "single": lambda: VariedPlanner(self._of_one_net, self.scenes),
+                "ensemble": lambda: VariedPlanner(self.planner, self.scenes),
+                "tandem": self._tandem,
+                "cma": self._evolution,
+            }
+            self._made[name] = make[name]()
+            self.seconds[name] = time.perf_counter() - started
+        return self._made[name]
+
+    @property
+    def inverse(self) -> VariedPlanner:
+        """The robust planner, which others build on."""
+        return self["ensemble"]
+
+    def planner(self, values: Floats) -> InversePlanner:
+        """The robust planner of one scene, of ``values`` (k,) [SI]."""
+        return InversePlanner(self.landing.at(values), self.config.inverse, energy=self.energy, seed=self.seed)
+
+    def _of_one_net(self, values: Floats) -> InversePlanner:
+        landing = self.landing.at(values)
+        return InversePlanner(lambda s: landing(s)[:1], self.config.inverse)
+
+    def _tandem(self) -> Planner:
+        low, high = (torch.from_numpy(bound.astype(np.float32)) for bound in self.scenes.bounds())
+
+        def see(stretches: Tensor, scene: Tensor) -> tuple[Tensor, Tensor]:
+            landings = self.landing(stretches, (low + high) / 2 + scene * (high - low) / 2)
+            mean = landings.mean(dim=0)
+            return mean, ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
+
+        tandem = TandemPlanner(
+            see,
+            self.data["landing"],
+            replace(self.config.tandem, seed=self.seed),
+            permutations=self.net.permutations.numpy(),
+            signs=self.net.signs[:, :2].numpy(),
+            scene_values=len(self.scenes.observed),
+        )
+        return ScaledScenes(tandem, self.scenes)
+
+    def _evolution(self) -> Planner:
+        search, hops = EvolutionConfig(evaluations=self.config.search, seed=self.seed), stored(self.data, self.comparison)
+
+        def make(values: Floats) -> EvolutionPlanner:
+            landing = self.landing.at(values)
+            return EvolutionPlanner(lambda s: mean_landing(landing, s), hops.at(values), search)
+
+        return VariedPlanner(make, self.scenes)
