@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surrogate import dataset
 from tensegrity_gym import Scene, form_find, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.scene_ranges import scene_ranges
+from tensegrity_gym.task import reach, reachable
 from training.compare import report, run
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
-from training.compare.hops import PERTURBATION, Hops, repeated
+from training.compare.hops import PERTURBATION, Hops, VariedHops, repeated
 from training.compare.results import Outcome
 from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
 
@@ -131,3 +134,79 @@ def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path,
     for changes in ({"budgets": (2,)}, {"seeds": (0,)}, {"seeds": (1, 2)}, {"policy_seeds": (1, 2)}, {"algorithms": ("dqn",)}):
         with pytest.raises(InvalidParameterError, match=next(iter(changes))):
             CompareConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_targets_of_varied_scenes_lie_where_they_should_in_their_own_scene() -> None:
+    places = registered.read("varied", "touchdown")
+    assert {p: len(t) for p, t in places.items()} == registered.COUNTS
+    scenes = registered.scenes_of("varied", "touchdown")
+    hops = VariedHops(scenes, {})
+    low, high = scenes.bounds()
+    for place, rows in places.items():
+        assert ((rows[:, 2:] >= low) & (rows[:, 2:] <= high)).all()
+        there = [bool(reachable(row[:2] * (0.99 if place == "boundary" else 1), hops.at(row[2:]))) for row in rows]
+        assert there == [place != "beyond"] * len(rows)
+    with pytest.raises(InvalidParameterError, match="varied at touchdown"):
+        registered.read("varied", "rest")
+
+
+def test_each_hop_is_simulated_in_its_own_scene() -> None:
+    scenes = scene_ranges({"gravity": (1.6, 9.81), "friction": (0.3, 0.8), "duration": 0.05})
+    asked = np.array([(0.1, 0.0, 9.0, 0.4), (0.5, 0.0, 2.0, 0.7), (0.2, 0.0, 9.0, 0.4)])
+    stretches = np.array([(0.3, 0.4, 0.5, 0.6), (0.5, 0.5, 0.4, 0.3), (0.6, 0.3, 0.3, 0.6)])
+    hops = VariedHops(scenes, {})
+    landings = hops.land(stretches, asked)
+    earthly, lunar = (replace(scenes.base, gravity=g, friction=mu) for g, mu in ((9.0, 0.4), (2.0, 0.7)))
+    np.testing.assert_array_equal(landings[[0, 2]], simulate(stretches[[0, 2]], scene=earthly).landing)
+    np.testing.assert_array_equal(landings[[1]], simulate(stretches[[1]], scene=lunar).landing)
+    moved = hops.perturbed(stretches, 2, asked)
+    np.testing.assert_array_equal(moved[:, 0], landings)
+    np.testing.assert_array_equal(moved[[1]], Hops(lunar, {}).perturbed(stretches[[1]], 2))
+    assert hops.calls == 3 + 9
+
+
+@pytest.fixture(scope="module")
+def varied_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished quick comparison where scenes vary."""
+    folder = tmp_path_factory.mktemp("varied")
+    run.main(CompareConfig(out=folder, scene="varied", quick=True, progress=False))
+    return folder / "quick"
+
+
+def test_comparison_of_varied_scenes_tells_all_in_reaches_and_goes_on_after_a_loss(varied_folder: Path) -> None:
+    text = (varied_folder / "results.md").read_text(encoding="utf-8")
+    for said in ("nearest stored hop", "best of 2 simulated", "2 simulated in turn", "tandem", "SAC", "[% of reach]", "m/s²"):
+        assert said in text
+    assert "gravity 1.6 to 9.81, friction 0.3 to 0.8" in text
+    lost = ("score_sac_1_32", "policy_sac_1_32", "net_1_32", "plans_1_32", "score_ensemble_1_32", "score_tandem_1_32")
+    kept = {n: json.loads((varied_folder / "stages" / f"{n}.json").read_text())["results"] for n in lost}
+    for name in lost:
+        (varied_folder / "stages" / f"{name}.json").unlink()
+    config = replace(CompareConfig(out=varied_folder.parent, scene="varied", progress=False), quick=True).shortened()
+    again = run.comparison_of(config)
+    again.run()
+    assert set(again.stages.results) - set(again.stages.skipped) == set(lost)
+    for name in lost:
+        if name.startswith("score"):
+            assert again.stages.results[name] == kept[name]
+    outcome = Outcome(again)
+    assert outcome.methods == ["nearest", "single", "ensemble", "best2", "refine2", "tandem", "cma", "sac"]
+    # errors are distances of the stored landings over the reach of each target's own scene
+    landings = np.array(kept["score_ensemble_1_32"]["landings"])[:2, 1:]
+    inside = again.places["inside"]
+    own = [reach(again.hops.at(row[2:])) for row in inside]
+    wanted = np.linalg.norm(landings - inside[:, None, :2], axis=2).mean(axis=1) / own
+    np.testing.assert_allclose(outcome.errors("ensemble", 32)[1], wanted)
+
+
+def test_data_of_varied_scenes_are_taken_from_a_file_that_fits(varied_folder: Path, tmp_path: Path) -> None:
+    config = CompareConfig(out=tmp_path, scene="varied", quick=True, progress=False).shortened()
+    fits = run.comparison_of(replace(config, data=varied_folder / "hops_0_0_32.h5"))
+    np.testing.assert_array_equal(fits.pool(0)["scene_gravity"], dataset.read(varied_folder / "hops_0_0_32.h5")["scene_gravity"])
+    # planners learn from lengths as they would be on Earth
+    raw, alike = fits.pool(0).rows(slice(0, 16)), fits.learnt(0, 16)
+    np.testing.assert_allclose(alike["landing"], raw["landing"] * (raw["scene_gravity"] / 9.80665)[:, None])
+    with pytest.raises(DataFileError, match="gravity from"):  # hops cut off in flight
+        run.comparison_of(replace(config, data=varied_folder / "hops_0_0_32.h5", duration=1.0)).pool(0)
+    with pytest.raises(DataFileError, match="gravity from"):
+        run.comparison_of(replace(config, scene="moon", data=varied_folder / "hops_0_0_32.h5")).pool(0)

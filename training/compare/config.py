@@ -21,7 +21,8 @@ class CompareConfig:
     out: Path = Path("runs/compare")
     """Folder of all results of one scene and landing."""
     scene: str = "earth"
-    """Scene preset with registered targets: earth, moon or slope."""
+    """Scene with registered targets: earth, moon, slope, or varied, where each target has a gravity and friction of its own
+    (at touchdown only)."""
     landing: str = "touchdown"
     """Where a landing is read: touchdown or rest."""
     fidelity: str = "paper"

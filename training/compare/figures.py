@@ -31,9 +31,9 @@ def _look(k: int) -> dict[str, object]:
 
 def _levels(axes: Axes, outcome: Outcome, along: str = "y") -> None:
     draw = axes.axhline if along == "y" else axes.axvline
-    draw(1e3 * outcome.floor, color="#888888", ls=":", label="floor: start moved by 10 µm")
+    draw(outcome.factor * outcome.floor, color="#888888", ls=":", label="floor: start moved by 10 µm")
     if outcome.oracle is not None:
-        draw(1e3 * outcome.oracle, color="#888888", ls="--", label="CMA-ES on the simulator")
+        draw(outcome.factor * outcome.oracle, color="#888888", ls="--", label="CMA-ES on the simulator")
 
 
 def sample_efficiency(outcome: Outcome, path: Path) -> Path:
@@ -43,12 +43,12 @@ def sample_efficiency(outcome: Outcome, path: Path) -> Path:
         for k, method in enumerate(outcome.methods):
             budgets = outcome.budgets(method)
             found = [outcome.summary(method, b) for b in budgets]
-            axes.plot(budgets, [1e3 * s.mean for s in found], label=label(method), ms=5, **_look(k))  # type: ignore[arg-type]
+            axes.plot(budgets, [outcome.factor * s.mean for s in found], label=label(method), ms=5, **_look(k))  # type: ignore[arg-type]
             if found[0].seeds > 1:
-                low, high = [1e3 * s.low for s in found], [1e3 * s.high for s in found]
+                low, high = [outcome.factor * s.low for s in found], [outcome.factor * s.high for s in found]
                 axes.fill_between(budgets, low, high, color=COLOURS[k % len(COLOURS)], alpha=0.15, lw=0)
         _levels(axes, outcome)
-        axes.set(xscale="log", yscale="log", xlabel="simulator calls learnt from", ylabel="landing error, IQM [mm]")
+        axes.set(xscale="log", yscale="log", xlabel="simulator calls learnt from", ylabel=f"landing error, IQM [{outcome.shown}]")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
         return save(figure, path)
@@ -56,15 +56,17 @@ def sample_efficiency(outcome: Outcome, path: Path) -> Path:
 
 def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
     """Share of landings within a radius of the target, at one budget."""
-    radii = np.geomspace(1e-4, 2 * outcome.reach, 200)
+    radii = np.geomspace(6e-4, 2, 200) * float((outcome.reaches / outcome.unit).max())
     with _style():
         figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
         for method in (m for m in outcome.methods if budget in outcome.budgets(m)):
             share = performance_profile(outcome.landing_errors(method, budget, "inside"), radii)
             look = _look(outcome.methods.index(method)) | {"marker": None}
-            axes.plot(1e3 * radii, 100 * share, label=label(method), **look)  # type: ignore[arg-type]
+            axes.plot(outcome.factor * radii, 100 * share, label=label(method), **look)  # type: ignore[arg-type]
         _levels(axes, outcome, along="x")
-        axes.set(xscale="log", xlabel="radius around the target [mm]", ylabel="landings within it [%]", ylim=(0, 101))
+        axes.set(
+            xscale="log", xlabel=f"radius around the target [{outcome.shown}]", ylabel="landings within it [%]", ylim=(0, 101)
+        )
         axes.xaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
         return save(figure, path)
@@ -77,13 +79,16 @@ def pareto(outcome: Outcome, path: Path) -> Path:
         for k, method in enumerate(outcome.methods):
             budgets = outcome.budgets(method)
             seconds = [max(outcome.learning_seconds(method, b), 1e-3) for b in budgets]
-            errors = [1e3 * outcome.summary(method, b).mean for b in budgets]
+            errors = [outcome.factor * outcome.summary(method, b).mean for b in budgets]
             axes.plot(seconds, errors, label=label(method), lw=0.8, ms=0, **(_look(k) | {"marker": None}))  # type: ignore[arg-type]
             sizes = [12 * np.log10(b) ** 1.5 for b in budgets]
             axes.scatter(seconds, errors, s=sizes, color=COLOURS[k % len(COLOURS)], marker=MARKERS[k % len(MARKERS)])
         _levels(axes, outcome)
         axes.set(
-            xscale="log", yscale="log", xlabel="wall time of learning, simulating left out [s]", ylabel="landing error, IQM [mm]"
+            xscale="log",
+            yscale="log",
+            xlabel="wall time of learning, simulating left out [s]",
+            ylabel=f"landing error, IQM [{outcome.shown}]",
         )
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)

@@ -6,13 +6,17 @@ import os
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
 
 from surrogate.storage import atomic_path, ensure_folder, package_versions
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_PLACES
 from training.compare import figures
 from training.compare.results import Outcome, Summary, label
+from training.compare.statistics import interquartile_mean
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -21,9 +25,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _cell(found: Summary) -> str:
-    middle = f"{1e3 * found.mean:.3g}"
-    return middle if found.seeds == 1 else f"{middle} [{1e3 * found.low:.3g}, {1e3 * found.high:.3g}]"
+def _cell(found: Summary, factor: float) -> str:
+    middle = f"{factor * found.mean:.3g}"
+    return middle if found.seeds == 1 else f"{middle} [{factor * found.low:.3g}, {factor * found.high:.3g}]"
 
 
 def _plain(value: float) -> str:
@@ -32,23 +36,24 @@ def _plain(value: float) -> str:
 
 
 def by_budget(outcome: Outcome) -> str:
-    """Interquartile mean errors on targets inside, by method and budget [mm]."""
+    """Interquartile mean errors on targets inside, by method and budget."""
     budgets = sorted({b for m in outcome.methods for b in outcome.budgets(m)})
     rows = [
-        [label(m), *(_cell(outcome.summary(m, b)) if b in outcome.budgets(m) else "" for b in budgets)] for m in outcome.methods
+        [label(m), *(_cell(outcome.summary(m, b), outcome.factor) if b in outcome.budgets(m) else "" for b in budgets)]
+        for m in outcome.methods
     ]
-    return table(["error [mm] after so many simulator calls", *(f"{b:,}".replace(",", " ") for b in budgets)], rows)
+    return table([f"error [{outcome.shown}] after so many simulator calls", *(f"{b:,}".replace(",", " ") for b in budgets)], rows)
 
 
 def by_place(outcome: Outcome) -> str:
-    """Errors inside, on the boundary and beyond it, of each method at its largest budget [mm]."""
+    """Errors inside, on the boundary and beyond it, of each method at its largest budget."""
     rows = []
     for m in [*outcome.methods, *(["oracle"] if outcome.oracle is not None else [])]:
         budget = outcome.budgets(m)[-1]
         name = "CMA-ES on the simulator" if m == "oracle" else label(m)
-        cells = [f"{1e3 * outcome.summary(m, budget, place).mean:.3g}" for place in TARGET_PLACES]
+        cells = [f"{outcome.factor * outcome.summary(m, budget, place).mean:.3g}" for place in TARGET_PLACES]
         rows.append([name, f"{budget:,}".replace(",", " "), *cells])
-    return table(["error [mm] of targets", "calls", *TARGET_PLACES], rows)
+    return table([f"error [{outcome.shown}] of targets", "calls", *TARGET_PLACES], rows)
 
 
 def in_detail(outcome: Outcome) -> str:
@@ -63,7 +68,7 @@ def in_detail(outcome: Outcome) -> str:
                 label(m),
                 f"{budget:,}".replace(",", " "),
                 str(found.seeds),
-                f"{1e3 * found.p95:.3g}",
+                f"{outcome.factor * found.p95:.3g}",
                 f"{100 * found.missed:.1f}",
                 f"{outcome.improvement('ensemble', m, budget):.2f}" if comparable else "",
                 *(["", ""] if times is None else [_plain(1e3 * t) for t in times]),
@@ -75,7 +80,7 @@ def in_detail(outcome: Outcome) -> str:
         "method",
         "calls",
         "seeds",
-        "p95 [mm]",
+        f"p95 [{outcome.shown}]",
         f"farther than {SUCCESS_RADIUS:g} reach [%]",
         "P(planner better)",
         "p50 [ms]",
@@ -86,6 +91,23 @@ def in_detail(outcome: Outcome) -> str:
     return table(head, rows)
 
 
+def by_gravity(outcome: Outcome) -> str:
+    """Errors in metres on targets inside, by thirds of the range of gravity, of each method at its largest budget."""
+    rows = outcome.rows["inside"]
+    gravity = outcome.comparison.targets[rows, 2 + outcome.comparison.scenes.observed.index("gravity")]
+    edges = np.linspace(*outcome.comparison.scenes.ranges["gravity"], 4)
+    third = np.clip(np.searchsorted(edges, gravity) - 1, 0, 2)
+    head = [f"{low:.1f} to {high:.1f} m/s²" for low, high in pairwise(edges)]
+    cells = []
+    for m in outcome.methods:
+        budget = outcome.budgets(m)[-1]
+        errors = outcome.errors(m, budget) * outcome.unit[rows]
+        parts = [errors[:, third == k] for k in range(3)]
+        shown = [f"{1e3 * interquartile_mean(part):.3g}" if part.size else "" for part in parts]
+        cells.append([label(m), f"{budget:,}".replace(",", " "), *shown])
+    return table(["error [mm] where gravity is", "calls", *head], cells)
+
+
 def section(outcome: Outcome, pictures: str) -> str:
     """One scene and landing, as Markdown; ``pictures`` is where its figures lie."""
     comparison = outcome.comparison
@@ -94,16 +116,16 @@ def section(outcome: Outcome, pictures: str) -> str:
     oracle = ""
     if outcome.oracle is not None:
         calls = outcome.records["oracle"]["calls_per_answer"]
-        oracle = f" CMA-ES on the simulator, {calls:.0f} hops a target, reaches {1e3 * outcome.oracle:.3g} mm."
+        oracle = f" CMA-ES on the simulator, {calls:.0f} hops a target, reaches {_shown(outcome, outcome.oracle)}."
     budget = outcome.common_budget
     return f"""## {config.scene.capitalize()}, landing read at {config.landing}
 
-Run on {datetime.now(UTC).date()}: model version {MODEL_VERSION}, fidelity {config.fidelity}, reach {1e3 * outcome.reach:.0f} mm,
+Run on {datetime.now(UTC).date()}: model version {MODEL_VERSION}, fidelity {config.fidelity}, {_scene(outcome)},
 targets {", ".join(f"{n} {p}" for p, n in rows.items())}, {config.perturbations} moved starts an answer,
 {package_versions_text()}.
 
 Interquartile mean over targets inside and seeds, with its 95 % interval over seeds. The floor, how far a random hop's landing
-moves with its start, is {1e3 * outcome.floor:.2g} mm.{oracle}
+moves with its start, is {_shown(outcome, outcome.floor)}.{oracle}
 
 {by_budget(outcome)}
 
@@ -114,11 +136,23 @@ At the largest budget of each:
 {in_detail(outcome)}
 
 {by_place(outcome)}
-
+{chr(10) + by_gravity(outcome) + chr(10) if outcome.varied else ""}
 ![Share of landings within a radius of the target, after {budget:,} calls]({pictures}/results_{name}_profile.png)
 
 ![Learning time against error]({pictures}/results_{name}_pareto.png)
 """
+
+
+def _shown(outcome: Outcome, value: float) -> str:
+    return f"{outcome.factor * value:.2g} {outcome.shown}"
+
+
+def _scene(outcome: Outcome) -> str:
+    least, most = 1e3 * outcome.reaches.min(), 1e3 * outcome.reaches.max()
+    if not outcome.varied:
+        return f"reach {most:.0f} mm"
+    ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in outcome.comparison.scenes.ranges.items())
+    return f"{ranges},\nreaches of the targets' scenes {least:.0f} to {most:.0f} mm"
 
 
 def package_versions_text() -> str:

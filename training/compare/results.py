@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_LIMIT, TARGET_PLACES, reach
+from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_LIMIT, TARGET_PLACES
 from tensegrity_gym.types import Floats
 from training.compare.run import Comparison
 from training.compare.statistics import interquartile_mean, interval, probability_of_improvement
@@ -45,24 +45,32 @@ def _place(method: str) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Summary:
-    """Errors of one method at one budget, on the targets of one place."""
+    """Errors of one method at one budget, on the targets of one place, in metres or, where scenes vary, in reaches."""
 
-    mean: float  #: interquartile mean [m]
-    low: float  #: its 95 % interval [m]
-    high: float  #: likewise [m]
-    p95: float  #: of single landings [m]
+    mean: float  #: interquartile mean
+    low: float  #: its 95 % interval
+    high: float  #: likewise
+    p95: float  #: of single landings
     missed: float  #: share of single landings farther than ``SUCCESS_RADIUS`` reaches from the target [-]
     seeds: int
 
 
 class Outcome:
-    """What a comparison found."""
+    """What a comparison found.
+
+    Errors are in metres; where scenes vary, and reaches with them, each is divided by the reach of its target's scene.
+    """
 
     def __init__(self, comparison: Comparison) -> None:
         self.comparison = comparison
         self.records = comparison.stages.results
         self.seconds = comparison.stages.seconds
-        self.reach = reach(comparison.scene)
+        self.varied = bool(comparison.scenes.ranges)
+        #: Reach of each target's scene [m], and what errors are divided by, shapes (targets,).
+        self.reaches = comparison.reaches
+        self.unit = self.reaches if self.varied else np.ones(len(self.reaches))
+        #: Name of the unit that errors are shown in, and how many of it one is.
+        self.shown, self.factor = ("% of reach", 100.0) if self.varied else ("mm", 1000.0)
         self.rows = {
             place: np.repeat([p == place for p in TARGET_PLACES], [len(comparison.places[p]) for p in TARGET_PLACES])
             for place in TARGET_PLACES
@@ -94,41 +102,44 @@ class Outcome:
         return [b for m, b in self.scores if m == method]
 
     def landing_errors(self, method: str, budget: int, place: str) -> Floats:
-        """Of every answer from every moved start [m], shape (seeds, targets, perturbations).
+        """Of every answer from every moved start, shape (seeds, targets, perturbations).
 
         A failed hop counts as one that landed as far away as any target may be.
         """
         rows = self.rows[place]
-        targets = self.comparison.targets[rows]
+        targets, unit = self.comparison.targets[rows, :2], self.unit[rows, None]
         parts = []
         for seed in self.scores[method, budget]:
             landings = np.array(self.records[f"score_{method}_{seed}_{budget}"]["landings"], dtype=np.float64)[rows, 1:]
-            parts.append(np.linalg.norm(landings - targets[:, None], axis=2))
-        return np.nan_to_num(np.stack(parts), nan=TARGET_LIMIT * self.reach)
+            error = np.linalg.norm(landings - targets[:, None], axis=2)
+            parts.append(np.where(np.isfinite(error), error, TARGET_LIMIT * self.reaches[rows, None]) / unit)
+        return np.stack(parts)
 
     def errors(self, method: str, budget: int, place: str = "inside") -> Floats:
-        """Mean over the moved starts [m], shape (seeds, targets)."""
+        """Mean over the moved starts, shape (seeds, targets)."""
         return self.landing_errors(method, budget, place).mean(axis=2)
 
     def summary(self, method: str, budget: int, place: str = "inside") -> Summary:
         """The numbers of a table's cell."""
         every, errors = self.landing_errors(method, budget, place), self.errors(method, budget, place)
+        limit = (SUCCESS_RADIUS * self.reaches / self.unit)[self.rows[place], None]
         return Summary(
             float(interquartile_mean(errors)),
             *interval(errors),
             p95=float(np.quantile(every, 0.95)),
-            missed=float((every > SUCCESS_RADIUS * self.reach).mean()),
+            missed=float((every > limit).mean()),
             seeds=len(errors),
         )
 
     @property
     def floor(self) -> float:
-        """How far moved starts land from where the unmoved one does, interquartile mean over random hops [m]."""
-        return float(interquartile_mean(np.array(self.records["floor"]["distances"]).mean(axis=1)))
+        """How far moved starts land from where the unmoved one does, interquartile mean over random hops."""
+        record = self.records["floor"]
+        return float(interquartile_mean(np.array(record["distances"]).mean(axis=1) / np.array(record.get("reaches", 1.0))))
 
     @property
     def oracle(self) -> float | None:
-        """Interquartile mean error of CMA-ES on the simulator [m], None where it was not run."""
+        """Interquartile mean error of CMA-ES on the simulator, None where it was not run."""
         found = [b for m, b in self.scores if m == "oracle"]
         return self.summary("oracle", found[0]).mean if found else None
 

@@ -49,12 +49,8 @@ def draw() -> dict[str, dict[str, dict[str, list[list[float]]]]]:
     for i, name in enumerate(VARIED, len(SCENES)):
         rng = np.random.default_rng([SEED, i, LANDINGS.index("touchdown")])
         scenes = scenes_of(name, "touchdown")
-        drawn = {
-            place: [draw_episode(rng, scenes, place).observation for _ in range(count)] for place, count in COUNTS.items()
-        }
-        found[name] = {
-            "touchdown": {p: np.round(np.array(rows, dtype=np.float64), 4).tolist() for p, rows in drawn.items()}
-        }
+        drawn = {place: [draw_episode(rng, scenes, place).observation for _ in range(count)] for place, count in COUNTS.items()}
+        found[name] = {"touchdown": {p: np.round(np.array(rows, dtype=np.float64), 4).tolist() for p, rows in drawn.items()}}
     return found
 
 
