@@ -7,17 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from tensegrity_gym.batch import Progress, run_shares
+from tensegrity_gym.batch import Progress, run_shares, thread_count
 from tensegrity_gym.core import records as rec
 from tensegrity_gym.core import rollout as kernel
 from tensegrity_gym.core.flight import fly_rigidly
-from tensegrity_gym.core.lanes import lane_count, lanes_empty
+from tensegrity_gym.core.lanes import lane_count
 from tensegrity_gym.design import Design
 from tensegrity_gym.energies import centre_of_mass, elastic_energies, gravitational_energy, kinetic_energy
 from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.types import ENERGY_NAMES, Floats, Ground, HopStatus, Structure
+from tensegrity_gym.workspaces import hop_lanes, without_lanes
 
 #: Integrators: kernel, and by how much of a step velocities trail positions.
 INTEGRATORS: dict[str, tuple[Any, float]] = {
@@ -33,6 +34,8 @@ REST_ENERGY = 1e-3
 REST_TIME = 1.0
 #: A take-off whose ballistic rise is below this share of l is no flight.
 LEAST_RISE = 1e-3
+#: Up to so many hops a thread are followed one after another, without lanes: eight at once cost as much as some alone.
+ALONE = 1
 #: Returns to the ground after touchdown whose times are kept.
 N_IMPACTS = 8
 
@@ -172,38 +175,20 @@ def _records(problem: Problem, starts: Floats, phase: int, usable: np.ndarray, r
     )
 
 
-def hop_lanes(structure: Structure) -> rec.LaneState:
-    """Work arrays of one thread."""
-    dtype = structure.mass.dtype
-    count, n = lane_count(dtype), len(structure.mass)
-    return rec.LaneState(
-        x=lanes_empty((n, 3), dtype),
-        v=lanes_empty((n, 3), dtype),
-        f=lanes_empty((n, 3), dtype),
-        memory=lanes_empty((structure.n_axial_members,), dtype),
-        mid=lanes_empty((n, 3), dtype),
-        work=lanes_empty((4 * n, 3), dtype),
-        one=np.zeros((3, n, 3), dtype),
-        one_memory=np.zeros(structure.n_axial_members, dtype),
-        actuator_length=lanes_empty((len(structure.actuators),), dtype),
-        scalars=lanes_empty((rec.N_SCALARS,), dtype),
-        hop=np.zeros(count, dtype=np.int64),
-        step=np.zeros(count, dtype=np.int64),
-        quiet=np.zeros(count, dtype=np.int64),
-        phase=np.zeros(count, dtype=np.int64),
-    )
-
-
 def _roll_out(problem: Problem, stop: int, records: rec.HopRecords, threads: int | None, progress: Progress | None) -> None:
     dtype = np.dtype(problem.fidelity.precision)
     typed = problem.structure.astype(dtype)
     ground = problem.ground._replace(gravity=problem.ground.gravity.astype(dtype))
     run, settings = INTEGRATORS[problem.fidelity.integrator][0], problem.settings(stop)
+    n = len(records.status)
+    count = 1 if n <= ALONE * thread_count(threads) else lane_count(dtype)
 
     def work(first: int, last: int, counter: np.ndarray) -> None:
-        run(typed, ground, settings, typed.actuator_length, records, hop_lanes(typed), first, last, counter)
+        lanes = hop_lanes(typed, count)
+        kernel_lanes = without_lanes(lanes) if count == 1 else lanes
+        run(typed, ground, settings, typed.actuator_length, records, lanes, kernel_lanes, first, last, counter)
 
-    run_shares(work, len(records.status), threads, lane_count(dtype), progress)
+    run_shares(work, n, threads, count, progress)
 
 
 def _fly(problem: Problem, records: rec.HopRecords) -> None:

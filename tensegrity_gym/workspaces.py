@@ -1,8 +1,8 @@
-"""Work arrays of the searches for equilibria: lanes of lattices, or a single one."""
+"""Work arrays of hops and of the searches for equilibria: lanes of lattices, or a single one."""
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from tensegrity_gym.core.conjugate_gradient import DescentLanes
 from tensegrity_gym.core.descent import DescentCases, GroundLanes
 from tensegrity_gym.core.lanes import lane_count, lanes_empty
 from tensegrity_gym.core.newton import NewtonLanes
+from tensegrity_gym.core.records import N_SCALARS, LaneState
 from tensegrity_gym.core.relaxation import RelaxationLanes
 from tensegrity_gym.types import Floats, Structure
 
@@ -23,18 +24,43 @@ def lanes_for(n: int) -> int:
     return 1 if n <= ALONE else lane_count(np.float64)
 
 
-def lane_array(count: int, *shape: int) -> np.ndarray:
+def lane_array(count: int, *shape: int, dtype: Any = np.float64) -> np.ndarray:
     """Zeros of ``shape + (count,)``; ``count`` is that of a vector's lanes, or one."""
-    return lanes_empty(shape) if count == lane_count(np.float64) else np.zeros((*shape, count))
+    return lanes_empty(shape, dtype) if count == lane_count(dtype) else np.zeros((*shape, count), dtype)
 
 
-Lanes = TypeVar("Lanes", NewtonLanes, DescentLanes, RelaxationLanes, GroundLanes)
+Lanes = TypeVar("Lanes", LaneState, NewtonLanes, DescentLanes, RelaxationLanes, GroundLanes)
 
 
 def without_lanes(lanes: Lanes) -> Lanes:
-    """The work arrays of a single lane, seen without their lane axis; lists of the lanes themselves stay."""
-    arrays = lanes._asdict()
-    return lanes._replace(**{name: array.reshape(array.shape[:-1]) for name, array in arrays.items() if array.ndim > 1})
+    """The work arrays of a single lane, seen without their lane axis; lists of the lanes, and what has no lanes, stay."""
+    arrays = {name: array for name, array in lanes._asdict().items() if array.ndim > 1 and array.shape[-1] == 1}
+    return lanes._replace(**{name: array.reshape(array.shape[:-1]) for name, array in arrays.items()})
+
+
+def hop_lanes(structure: Structure, count: int) -> LaneState:
+    """Work arrays of one thread for ``count`` hops at a time."""
+    dtype, n = structure.mass.dtype, len(structure.mass)
+
+    def array(*shape: int) -> np.ndarray:
+        return lane_array(count, *shape, dtype=dtype)
+
+    return LaneState(
+        x=array(n, 3),
+        v=array(n, 3),
+        f=array(n, 3),
+        memory=array(structure.n_axial_members),
+        mid=array(n, 3),
+        scratch=array(4 * n, 3),
+        one=np.zeros((3, n, 3), dtype),
+        one_memory=np.zeros(structure.n_axial_members, dtype),
+        actuator_length=array(len(structure.actuators)),
+        scalars=array(N_SCALARS),
+        hop=np.zeros(count, dtype=np.int64),
+        step=np.zeros(count, dtype=np.int64),
+        quiet=np.zeros(count, dtype=np.int64),
+        phase=np.zeros(count, dtype=np.int64),
+    )
 
 
 def newton_lanes(n_masses: int, members: int, unloaded_length: Floats, n_slots: int, count: int) -> NewtonLanes:

@@ -9,6 +9,7 @@ import numpy as np
 from tensegrity_gym.core.forces import lattice_forces
 from tensegrity_gym.core.integrators import runge_kutta_step, symplectic_euler_step, velocity_verlet_step
 from tensegrity_gym.core.jit import jit
+from tensegrity_gym.core.lanes import load1, store1
 from tensegrity_gym.types import Floats, Ground, Structure
 
 #: Nothing but the members.
@@ -31,8 +32,8 @@ def _steps(method, structure, actuator_length, ground, dt, first_kick, steps, x,
             done = velocity_verlet_step(lattice_forces, structure, actuator_length, ground, dt, kick, x, v, f, memory, work)
         else:
             done = runge_kutta_step(lattice_forces, structure, actuator_length, ground, dt, kick, x, v, f, memory, work)
-        losses[0] += done[0] * dt
-        losses[1] += done[1]
+        store1(losses, 0, load1(losses, 0) + done[0] * dt)
+        store1(losses, 1, load1(losses, 1) + done[1])
         kick = dt
 
 

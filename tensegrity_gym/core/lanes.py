@@ -3,8 +3,9 @@
 A batch of lattices is stored as structure of arrays with the lanes innermost, ``x[mass, component, lane]``, one 512-bit
 vector per number: 8 lanes of float64 or 16 of float32. ``load(x, i, c)`` gives all lanes of one number as a ``Lanes`` value;
 ``+ - * /``, comparisons, ``sqrt``, ``fma``, ``select`` act lane by lane. The same functions accept arrays without the lane
-axis and then work on scalars: every kernel is its own scalar twin, and gives the same bits, because each operation is IEEE
-exact and no lane ever sees its neighbours.
+axis and then work on single numbers: every kernel is its own scalar twin, and gives the same bits, because each operation is
+IEEE exact and no lane ever sees its neighbours. A single number is a type of its own too, ``Lanes`` of one, because a plain
+float32 would be promoted by every literal, and round elsewhere.
 
 Loads and stores take raw offsets: no bounds are checked, no negative index wraps. Validate one layer up.
 """
@@ -31,11 +32,11 @@ def lane_count(dtype: Any) -> int:
 
 
 class LanesType(types.Type):
-    """numba type of a vector of floats, one a lane."""
+    """numba type of a vector of floats, one a lane; of ``count`` 1 it is a scalar that meets literals as a vector does."""
 
-    def __init__(self, dtype: types.Float) -> None:
+    def __init__(self, dtype: types.Float, count: int) -> None:
         self.dtype = dtype
-        self.count = VECTOR_BITS // dtype.bitwidth
+        self.count = count
         super().__init__(name=f"Lanes({dtype} x {self.count})")
 
 
@@ -51,8 +52,9 @@ def _llvm_float(dtype: types.Float) -> ir.Type:
     return ir.DoubleType() if dtype.bitwidth == 64 else ir.FloatType()
 
 
-def _llvm_lanes(lanes: LanesType) -> ir.VectorType:
-    return ir.VectorType(_llvm_float(lanes.dtype), lanes.count)
+def _llvm_lanes(lanes: LanesType) -> ir.Type:
+    element = _llvm_float(lanes.dtype)
+    return element if lanes.count == 1 else ir.VectorType(element, lanes.count)
 
 
 @register_model(LanesType)
@@ -64,36 +66,32 @@ class _LanesModel(models.PrimitiveModel):
 @register_model(MaskType)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: MaskType) -> None:
-        super().__init__(dmm, fe_type, ir.VectorType(ir.IntType(1), fe_type.count))
+        bit = ir.IntType(1)
+        super().__init__(dmm, fe_type, bit if fe_type.count == 1 else ir.VectorType(bit, fe_type.count))
 
 
 # ---------------------------------------------------------------------------------------------- memory
-def _element_type(array: types.Array, scalar_ndim: int) -> types.Type | None:
-    """Scalar where ``array`` has ``scalar_ndim`` dimensions, lanes where it has one more."""
+def _element_type(array: types.Array, scalar_ndim: int) -> LanesType | None:
+    """One lane where ``array`` has ``scalar_ndim`` dimensions, a vector of them where it has one more."""
     if not isinstance(array, types.Array) or array.layout != "C" or not isinstance(array.dtype, types.Float):
         return None
-    if array.ndim == scalar_ndim:
-        return array.dtype
-    return LanesType(array.dtype) if array.ndim == scalar_ndim + 1 else None
+    counts = {scalar_ndim: 1, scalar_ndim + 1: VECTOR_BITS // array.dtype.bitwidth}
+    return LanesType(array.dtype, counts[array.ndim]) if array.ndim in counts else None
 
 
-def _pointer(context: Any, builder: Any, array_type: types.Array, array: Any, indices: list[Any], element: types.Type) -> Any:
+def _pointer(context: Any, builder: Any, array_type: types.Array, array: Any, indices: list[Any], element: LanesType) -> Any:
     """Pointer to the element; the last axis of a lane array is whole vectors."""
     struct = context.make_array(array_type)(context, builder, array)
     offset = indices[0]
     shape = cgutils.unpack_tuple(builder, struct.shape)
     for axis, index in enumerate(indices[1:], start=1):
         offset = builder.add(builder.mul(offset, shape[axis]), index)
-    if isinstance(element, LanesType):
-        offset = builder.mul(offset, ir.Constant(ir.IntType(64), element.count))
-        pointer = builder.gep(struct.data, [offset])
-        return builder.bitcast(pointer, _llvm_lanes(element).as_pointer())
-    return builder.gep(struct.data, [offset])
+    offset = builder.mul(offset, ir.Constant(ir.IntType(64), element.count))
+    return builder.bitcast(builder.gep(struct.data, [offset]), _llvm_lanes(element).as_pointer())
 
 
-def _alignment(element: types.Type) -> int:
-    dtype = element.dtype if isinstance(element, LanesType) else element
-    return int(dtype.bitwidth) // 8
+def _alignment(element: LanesType) -> int:
+    return int(element.dtype.bitwidth) // 8
 
 
 def _index(context: Any, builder: Any, value: Any, value_type: types.Type) -> Any:
@@ -101,7 +99,7 @@ def _index(context: Any, builder: Any, value: Any, value_type: types.Type) -> An
 
 
 def _make_load(n_index: int) -> Any:
-    def typed(array: types.Array) -> types.Type | None:
+    def typed(array: types.Array) -> LanesType | None:
         return _element_type(array, n_index)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -114,14 +112,14 @@ def _make_load(n_index: int) -> Any:
 
 @intrinsic
 def load(typingctx: Any, array: Any, i: Any, c: Any) -> Any:
-    """``array[i, c]``: a scalar of an (n, k) array, all lanes of an (n, k, lanes) one."""
+    """``array[i, c]``: one number of an (n, k) array, all lanes of an (n, k, lanes) one."""
     typed, generate = _make_load(2)
     return None if typed(array) is None else (signature(typed(array), array, i, c), generate)
 
 
 @intrinsic
 def load1(typingctx: Any, array: Any, i: Any) -> Any:
-    """``array[i]``: a scalar of an (n,) array, all lanes of an (n, lanes) one."""
+    """``array[i]``: one number of an (n,) array, all lanes of an (n, lanes) one."""
     typed, generate = _make_load(1)
     return None if typed(array) is None else (signature(typed(array), array, i), generate)
 
@@ -157,6 +155,8 @@ def _to_lanes(context: Any, builder: Any, value: Any, value_type: types.Type, ta
     if not isinstance(target, LanesType):
         return context.cast(builder, value, value_type, target)
     scalar = context.cast(builder, value, value_type, target.dtype)
+    if target.count == 1:
+        return scalar
     vector = ir.Constant(_llvm_lanes(target), ir.Undefined)
     first = builder.insert_element(vector, scalar, ir.Constant(ir.IntType(32), 0))
     mask = ir.Constant(ir.VectorType(ir.IntType(32), target.count), [0] * target.count)
@@ -245,7 +245,8 @@ _register_logic(operator.or_, "or_")
 def _call_llvm(builder: Any, name: str, kind: types.Type, args: list[Any]) -> Any:
     """Call LLVM's intrinsic ``name`` on scalars or vectors of ``kind``."""
     if isinstance(kind, LanesType):
-        llvm_type, suffix = _llvm_lanes(kind), f"v{kind.count}f{kind.dtype.bitwidth}"
+        llvm_type, suffix = _llvm_lanes(kind), f"f{kind.dtype.bitwidth}"
+        suffix = suffix if kind.count == 1 else f"v{kind.count}{suffix}"
     else:
         llvm_type, suffix = _llvm_float(kind), f"f{kind.bitwidth}"
     function_type = ir.FunctionType(llvm_type, [llvm_type] * len(args))
@@ -292,13 +293,13 @@ def select(typingctx: Any, condition: Any, yes: Any, no: Any) -> Any:
 
 @intrinsic
 def any_lane(typingctx: Any, condition: Any) -> Any:
-    """True if ``condition`` holds in any lane (a scalar's condition itself)."""
-    if isinstance(condition, types.Boolean):
-        return signature(types.boolean, condition), lambda context, builder, sig, args: args[0]
+    """True if ``condition`` holds in any lane."""
     if not isinstance(condition, MaskType):
         return None
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if sig.args[0].count == 1:
+            return args[0]
         bits = ir.IntType(sig.args[0].count)
         return builder.icmp_unsigned("!=", builder.bitcast(args[0], bits), ir.Constant(bits, 0))
 
@@ -308,7 +309,7 @@ def any_lane(typingctx: Any, condition: Any) -> Any:
 @intrinsic
 def splat(typingctx: Any, number: Any, like: Any) -> Any:
     """``number`` in every lane, of the type of ``like``."""
-    if not isinstance(like, (LanesType, types.Float)):
+    if not isinstance(like, LanesType):
         return None
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -323,24 +324,21 @@ def stack_rows(typingctx: Any, rows: Any, like: Any) -> Any:
 
     It lives until the compiled entry point returns; ask once, outside loops.
     """
-    if not isinstance(rows, types.IntegerLiteral):
+    if not isinstance(rows, types.IntegerLiteral) or not isinstance(like, LanesType):
         return None
-    count = rows.literal_value
-    lanes = isinstance(like, LanesType)
-    dtype = like.dtype if lanes else like
-    array_type = types.Array(dtype, 2 if lanes else 1, "C")
+    shape = [rows.literal_value, like.count][: 1 if like.count == 1 else 2]
+    dtype = like.dtype
+    array_type = types.Array(dtype, len(shape), "C")
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        element = _llvm_lanes(like) if lanes else _llvm_float(like)
         size = dtype.bitwidth // 8
-        width = like.count if lanes else 1
-        data = cgutils.alloca_once(builder, element, size=count)
+        data = cgutils.alloca_once(builder, _llvm_lanes(like), size=shape[0])
         array = context.make_array(array_type)(context, builder)
         populate_array(
             array,
             data=builder.bitcast(data, _llvm_float(dtype).as_pointer()),
-            shape=[ir.Constant(ir.IntType(64), n) for n in ((count, width) if lanes else (count,))],
-            strides=[ir.Constant(ir.IntType(64), n) for n in ((width * size, size) if lanes else (size,))],
+            shape=[ir.Constant(ir.IntType(64), n) for n in shape],
+            strides=[ir.Constant(ir.IntType(64), n) for n in (like.count * size, size)[-len(shape) :]],
             itemsize=ir.Constant(ir.IntType(64), size),
             meminfo=None,
         )

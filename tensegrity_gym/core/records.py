@@ -63,7 +63,7 @@ class LaneState(NamedTuple):
     f: np.ndarray  #: forces [N], shape (n_masses, 3, lanes)
     memory: np.ndarray  #: last damping force of each axial member [N], shape (n_axial_members, lanes)
     mid: np.ndarray  #: scratch positions [m], shape (n_masses, 3, lanes)
-    work: np.ndarray  #: scratch of the integrator, shape (4 n_masses, 3, lanes)
+    scratch: np.ndarray  #: of the integrator, shape (4 n_masses, 3, lanes)
     one: np.ndarray  #: scratch for one lattice: positions, velocities, forces, shape (3, n_masses, 3)
     one_memory: np.ndarray  #: scratch for one lattice, shape (n_axial_members,)
     actuator_length: np.ndarray  #: natural lengths [m], shape (n_actuators, lanes)

@@ -153,9 +153,10 @@ def next_hop(records, queue, last):
 
 
 @jit
-def rollout(forces, step_function, structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+def rollout(forces, step_function, structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
     """Run hops ``first`` to ``last`` of ``records`` from their release states in one thread's lanes.
 
+    ``work`` is ``lanes``, or of a single lane the same memory without its axis: the steps then compute one lattice only.
     ``actuator_length`` [m], shape (n_actuators,), are the unlocked natural lengths; ``progress[0]`` counts ended hops.
     """
     count = lanes.x.shape[2]
@@ -181,37 +182,37 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
             running += 1
     while running > 0:
         for k in range(settings.stride):
-            kick = load1(lanes.scalars, KICK)
+            kick = load1(work.scalars, KICK)
             power, lost, lowest = step_function(
                 forces,
                 structure,
-                lanes.actuator_length,
+                work.actuator_length,
                 ground,
                 dt,
                 kick,
-                lanes.x,
-                lanes.v,
-                lanes.f,
-                lanes.memory,
-                lanes.work,
+                work.x,
+                work.v,
+                work.f,
+                work.memory,
+                work.scratch,
             )
-            store1(lanes.scalars, KICK, splat(dt, kick))
-            store1(lanes.scalars, CONTACT_LOSS, load1(lanes.scalars, CONTACT_LOSS) + lost)
-            store1(lanes.scalars, DAMPING_LOSS, fma(power, dt, load1(lanes.scalars, DAMPING_LOSS)))
-            was = load1(lanes.scalars, AIRBORNE)
+            store1(work.scalars, KICK, splat(dt, kick))
+            store1(work.scalars, CONTACT_LOSS, load1(work.scalars, CONTACT_LOSS) + lost)
+            store1(work.scalars, DAMPING_LOSS, fma(power, dt, load1(work.scalars, DAMPING_LOSS)))
+            was = load1(work.scalars, AIRBORNE)
             now = select(lowest > 0.0, splat(1.0, was), splat(0.0, was))
             changed = (was < now) | (was > now)
             if any_lane(changed):
-                store1(lanes.scalars, AIRBORNE, now)
-                store1(lanes.scalars, WAS_AIRBORNE, was)
-                store1(lanes.scalars, WAS_LOWEST, load1(lanes.scalars, LOWEST))
-                store1(lanes.scalars, LOWEST, lowest)
+                store1(work.scalars, AIRBORNE, now)
+                store1(work.scalars, WAS_AIRBORNE, was)
+                store1(work.scalars, WAS_LOWEST, load1(work.scalars, LOWEST))
+                store1(work.scalars, LOWEST, lowest)
                 for lane in range(count):
                     if hop[lane] >= 0 and lanes.scalars[WAS_AIRBORNE, lane] != lanes.scalars[AIRBORNE, lane]:
                         time = (step[lane] + k + 1) * dt
                         phase[lane] = contact_change(structure, settings, lanes, lane, records, hop[lane], phase[lane], time)
-            store1(lanes.scalars, LOWEST, lowest)
-        watch(structure, lanes)
+            store1(work.scalars, LOWEST, lowest)
+        watch(structure, work)
         frames_due = False
         for lane in range(count):
             step[lane] += settings.stride
@@ -221,7 +222,7 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
             if settings.frame_stride > 0 and hop[lane] >= 0 and step[lane] % settings.frame_stride == 0:
                 frames_due = True
         if frames_due:
-            frame_energies(structure, settings, ground, lanes)
+            frame_energies(structure, settings, ground, work)
         for lane in range(count):
             if hop[lane] < 0:
                 continue
@@ -247,7 +248,7 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
 
 
 @jit(cache=True)
-def rollout_symplectic_euler(structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+def rollout_symplectic_euler(structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
     """:func:`rollout` of the lattice by symplectic Euler, compiled once and cached."""
     rollout(
         lattice_forces,
@@ -258,6 +259,7 @@ def rollout_symplectic_euler(structure, ground, settings, actuator_length, recor
         actuator_length,
         records,
         lanes,
+        work,
         first,
         last,
         progress,
@@ -265,7 +267,7 @@ def rollout_symplectic_euler(structure, ground, settings, actuator_length, recor
 
 
 @jit(cache=True)
-def rollout_velocity_verlet(structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+def rollout_velocity_verlet(structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
     """:func:`rollout` of the lattice by velocity Verlet, compiled once and cached."""
     rollout(
         lattice_forces,
@@ -276,6 +278,7 @@ def rollout_velocity_verlet(structure, ground, settings, actuator_length, record
         actuator_length,
         records,
         lanes,
+        work,
         first,
         last,
         progress,
@@ -283,7 +286,7 @@ def rollout_velocity_verlet(structure, ground, settings, actuator_length, record
 
 
 @jit(cache=True)
-def rollout_runge_kutta(structure, ground, settings, actuator_length, records, lanes, first, last, progress):
+def rollout_runge_kutta(structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
     """:func:`rollout` of the lattice by the classical Runge-Kutta method, compiled once and cached."""
     rollout(
         lattice_forces,
@@ -294,6 +297,7 @@ def rollout_runge_kutta(structure, ground, settings, actuator_length, records, l
         actuator_length,
         records,
         lanes,
+        work,
         first,
         last,
         progress,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from tensegrity_gym.core.contact import contact_impulse, impulse_work
 from tensegrity_gym.core.jit import jit
-from tensegrity_gym.core.lanes import any_lane, fma, load, select, store
+from tensegrity_gym.core.lanes import any_lane, fma, load, select, splat, store
 
 
 @jit
@@ -20,7 +20,7 @@ def runge_kutta_step(forces, structure, actuator_length, ground, dt, kick, x, v,
     n = structure.mass.shape[0]
     start_x, start_v, sum_x, sum_v = 0, n, 2 * n, 3 * n  # row offsets into work
     struck = _collide(structure, ground, x, v, work, start_x, start_v)
-    power = kick * 0.0
+    power = splat(0.0, load(x, 0, 0))
     for stage in range(4):
         share = 2.0 if stage == 1 or stage == 2 else 1.0
         ahead = 1.0 if stage == 2 else 0.5

@@ -18,7 +18,7 @@ def velocity_verlet_step(forces, structure, actuator_length, ground, dt, kick, x
 
     ``kick`` and ``work`` are not used. Returns as described in the package.
     """
-    half = splat(0.5 * dt, kick)
+    half = splat(0.5 * dt, load(x, 0, 0))
     first = _half_kick(structure, ground, half, True, x, v, f)
     lowest = load(x, 0, 2) + 1e30
     for i in range(structure.mass.shape[0]):
