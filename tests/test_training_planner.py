@@ -63,6 +63,20 @@ def test_answers_on_the_boundary_of_the_box_are_reached() -> None:
     assert plans.reachable.tolist() == [True, False]
 
 
+def test_a_step_that_rounding_leaves_no_solution_is_damped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two stretches steer landing and doubt: three residuals in two unknowns, whose matrix only the damping makes regular."""
+    slope = torch.tensor([(1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0)])
+
+    def residual(stretches: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        return stretches @ slope.T - torch.nn.functional.pad(goal, (0, 1)), slope.expand(len(stretches), 3, 4)
+
+    planner = InversePlanner(lambda s: s[None, :, :2], InverseConfig(damping=1e-12, steps=80))
+    monkeypatch.setattr(planner, "_residual", residual)
+    plans = planner.plan(np.array([(0.8, 0.7), (0.9, 0.75)]))
+    # least squares: (s0 - x)^2 + (s1 - y)^2 + (s0 + s1)^2 is least where s0 = (2x - y) / 3, s1 = (2y - x) / 3
+    np.testing.assert_allclose(plans.stretches[:, :2], [(0.3, 0.2), (0.35, 0.2)], atol=1e-3)
+
+
 def test_beyond_an_arms_length_it_points_at_the_target() -> None:
     directions = np.linspace(-0.6, 0.6, 7)
     targets = 1.3 * np.column_stack([np.cos(directions), np.sin(directions)])

@@ -166,7 +166,10 @@ class InversePlanner:
             free = slope.masked_fill(held[:, None], 0.0)
             # (J'J + d I)^-1 J' = J' (J J' + d I)^-1, and the latter is but 3 by 3
             system = free @ free.mT + damping[:, None, None] * eye
-            tried = (best - (free.mT @ torch.linalg.solve(system, residual[..., None]))[..., 0]).clamp(low, high)
+            solved, singular = torch.linalg.solve_ex(system, residual[..., None])
+            # both directions may run alike, and the damping have fallen below rounding: stay, and damp more
+            solved = solved.masked_fill(singular[:, None, None] != 0, 0.0)
+            tried = (best - (free.mT @ solved)[..., 0]).clamp(low, high)
             tried_residual, tried_slope = self._residual(tried, goal)
             tried_cost = (tried_residual**2).sum(dim=1)
             better = tried_cost < cost
