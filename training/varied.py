@@ -74,9 +74,9 @@ class NearestVariedHops:
     """Stored hops of many scenes: for each scene the planner that repeats one of them.
 
     The squared error to expect of repeating a hop is its landing's squared distance to the target plus what being of another
-    scene costs: ``weights`` (k,) [m^2] times the squared differences of the scene values, ranges being 2 long. How landings
-    change with the scene is read off the stored hops themselves, whose squared differences from their neighbours are a sum of
-    squared differences in stretches and scene, fitted by non-negative least squares (a linear variogram).
+    scene costs: ``weights`` (k,) [m^2] times the squared differences of the scene values, ranges being 2 long. These weights are
+    read off the stored hops themselves: how far apart hops with nearly the same stretches landed, squared, is fitted by a
+    constant and multiples of the squared differences of stretches and scene values (non-negative least squares).
 
     Args:
         stretches: shape (n, n_actuators).
@@ -98,11 +98,8 @@ class NearestVariedHops:
         count = min(NEIGHBOURS + 1, len(self.stretches))
         if count < 2:
             return np.zeros(self.values.shape[1])
-        points = np.column_stack([self.stretches / np.ptp(self.stretches, axis=0).clip(1e-9), self.values / 2])
-        near = KDTree(points).query(points, count)[1][:, 1:]  # the first is the hop itself
-        squares = np.concatenate([self.stretches, self.values], axis=1)
-        apart = ((squares[near] - squares[:, None]) ** 2).reshape(-1, squares.shape[1])
+        near = KDTree(self.stretches).query(self.stretches, count)[1][:, 1:]  # the first is the hop itself
+        apart = ((self.stretches[near] - self.stretches[:, None]) ** 2).sum(axis=2).reshape(-1, 1)
+        strange = ((self.values[near] - self.values[:, None]) ** 2).reshape(-1, self.values.shape[1])
         moved = ((self.landings[near] - self.landings[:, None]) ** 2).sum(axis=2).reshape(-1)
-        split = self.stretches.shape[1]
-        features = np.column_stack([apart[:, :split].sum(axis=1), apart[:, split:]])
-        return nnls(features, moved)[0][1:]
+        return nnls(np.column_stack([np.ones(len(apart)), apart, strange]), moved)[0][2:]
