@@ -35,9 +35,13 @@ def _added(energies: Floats) -> Floats:
 
 
 def hinge_angles(positions: Floats, bars: Ints) -> Floats:
-    """Angles between consecutive segments [rad], shape (n, n_bars, n_segments - 1)."""
+    """Angles between consecutive segments [rad], shape (n, n_bars, n_segments - 1).
+
+    A segment whose masses coincide has no direction: its angles are not numbers.
+    """
     vectors = _segments(positions, bars)
-    units = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        units = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     half = np.linalg.norm(units[:, :, 1:] - units[:, :, :-1], axis=-1) / 2
     return 2 * np.arcsin(np.clip(half, 0.0, 1.0))
 

@@ -71,6 +71,16 @@ def test_a_bar_of_one_segment_has_no_hinges() -> None:
     assert hinge_angles(x, s.bars).shape == (5, 24, 0)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_segment_without_a_direction_has_no_hinge_angles_and_says_nothing() -> None:
+    x = np.array(
+        [[[0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]], [[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0], [1.0, 2.0, 0]]]
+    )
+    angles = hinge_angles(x, np.array([[0, 1, 2, 3]]))[:, 0]
+    assert np.isnan(angles[0]).all()
+    np.testing.assert_allclose(angles[1], [np.pi / 2, 0.0], atol=1e-12)
+
+
 def test_the_centre_of_mass_is_the_mass_weighted_mean() -> None:
     s, x, _, _ = batch(3)
     expected = [sum(m * p for m, p in zip(s.mass, one, strict=True)) / s.mass.sum() for one in x]
