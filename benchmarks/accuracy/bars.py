@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import ellipe, ellipj, ellipk
 
 from benchmarks.accuracy.part import Data, Options, Part, table
-from benchmarks.accuracy.stepping import forces
+from benchmarks.accuracy.stepping import forces, only_bars
 from tensegrity_gym import Design
 from tensegrity_gym.types import Floats, Structure
 
@@ -31,25 +31,13 @@ def one_bar(design: Design) -> tuple[Structure, Floats]:
     n, bar = int(design.bar_segments), design.bar_mass
     end, inner = design.bar_mass_shares()
     mass = bar * np.array([end, *[inner] * (n - 1), end])
-    empty, pairs, one = np.zeros(0), np.zeros((0, 2), dtype=np.int64), np.ones(1)
     length = design.bar_length / n
-    structure = Structure(
-        mass=mass,
-        inverse_mass=1 / mass,
-        cables=pairs,
-        cable_stiffness=empty,
-        cable_length=empty,
-        cable_damping=empty,
-        actuators=pairs,
-        actuator_rigidity=empty,
-        actuator_length=empty,
-        actuator_damping=empty,
-        bars=np.arange(n + 1)[None],
-        segment_stiffness=design.bar_rigidity / length * one,
-        segment_length=length * one,
-        segment_damping=0 * one,
-        hinge_stiffness=design.hinge_stiffness * one,
-        hinge_damping=0 * one,
+    structure = only_bars(
+        mass,
+        np.arange(n + 1)[None],
+        stiffness=design.bar_rigidity / length,
+        length=length,
+        hinge_stiffness=design.hinge_stiffness,
     )
     return structure, np.linspace(0, design.bar_length, n + 1)[:, None] * [1.0, 0, 0]
 

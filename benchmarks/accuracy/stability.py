@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
 from benchmarks.accuracy.part import Data, Options, Part, table
-from benchmarks.accuracy.stepping import METHODS, SPACE, Motion
+from benchmarks.accuracy.stepping import METHODS, SPACE, Motion, only_bars
 from tensegrity_gym.types import Floats, Structure
 
 RATIOS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
@@ -26,25 +26,9 @@ def chain(contrast: float, ratio: float) -> tuple[Structure, Floats, float]:
     """
     soft, hard = STIFFNESS, contrast * STIFFNESS
     omega = np.sqrt((soft + hard + np.sqrt(soft**2 + hard**2 - soft * hard)) / MASS)
-    stiffness, empty, pairs = np.array([soft, hard]), np.zeros(0), np.zeros((0, 2), dtype=np.int64)
-    structure = Structure(
-        mass=np.full(3, MASS),
-        inverse_mass=np.full(3, 1 / MASS),
-        cables=pairs,
-        cable_stiffness=empty,
-        cable_length=empty,
-        cable_damping=empty,
-        actuators=pairs,
-        actuator_rigidity=empty,
-        actuator_length=empty,
-        actuator_damping=empty,
-        bars=np.array([[0, 1], [1, 2]]),
-        segment_stiffness=stiffness,
-        segment_length=np.full(2, LENGTH),
-        segment_damping=2 * ratio / omega * stiffness,
-        hinge_stiffness=np.zeros(2),
-        hinge_damping=np.zeros(2),
-    )
+    stiffness = np.array([soft, hard])
+    damping = 2 * ratio / omega * stiffness
+    structure = only_bars(np.full(3, MASS), np.array([[0, 1], [1, 2]]), stiffness=stiffness, length=LENGTH, damping=damping)
     return structure, np.arange(3)[:, None] * [LENGTH, 0, 0] + [0, 0, 5.0], float(omega)
 
 

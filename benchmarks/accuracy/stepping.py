@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tensegrity_gym.core.forces import lattice_forces
 from tensegrity_gym.core.integrators import runge_kutta_step, symplectic_euler_step, velocity_verlet_step
@@ -14,6 +15,41 @@ from tensegrity_gym.types import Floats, Ground, Structure
 
 #: Nothing but the members.
 SPACE = Ground(np.zeros(3), 0.0, 0.0)
+
+
+def only_bars(
+    mass: Floats,
+    bars: np.ndarray,
+    *,
+    stiffness: ArrayLike,
+    length: ArrayLike,
+    damping: ArrayLike = 0.0,
+    hinge_stiffness: ArrayLike = 0.0,
+) -> Structure:
+    """Bars without cables; ``mass`` [kg], ``bars`` (n, segments + 1), of the segments [N/m, m, N s/m], of the hinges [N m]."""
+
+    def each(value: ArrayLike) -> Floats:
+        return np.broadcast_to(value, len(bars)).astype(np.float64)
+
+    empty, pairs = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
+    return Structure(
+        mass=mass,
+        inverse_mass=1 / mass,
+        cables=pairs,
+        cable_stiffness=empty,
+        cable_length=empty,
+        cable_damping=empty,
+        actuators=pairs,
+        actuator_rigidity=empty,
+        actuator_length=empty,
+        actuator_damping=empty,
+        bars=bars,
+        segment_stiffness=each(stiffness),
+        segment_length=each(length),
+        segment_damping=each(damping),
+        hinge_stiffness=each(hinge_stiffness),
+        hinge_damping=each(0.0),
+    )
 
 
 @jit(cache=True)
