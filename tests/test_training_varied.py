@@ -7,13 +7,26 @@ import pytest
 import torch
 from torch import Tensor
 
+from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
+from surrogate.model import HopNet, NetConfig, scene_symmetries
+from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.scene_ranges import scene_ranges
+from training.evolution import EvolutionConfig
+from training.frozen import FrozenLanding
 from training.inverse import InversePlanner
 from training.similarity import EARTH, alike
 from training.tandem import TandemConfig, TandemPlanner
-from training.varied import NearestVariedHops, ScaledScenes, VariedPlanner, unit_values
+from training.varied import (
+    NearestVariedHops,
+    ScaledScenes,
+    VariedEvolution,
+    VariedPlanner,
+    fit_varied_kriging,
+    scene_values,
+    unit_values,
+)
 
 VARIED = scene_ranges({"gravity": (1.6, 9.81), "friction": (0.3, 0.8)}, "touchdown")
 
@@ -107,3 +120,65 @@ def test_nearest_of_many_scenes_weighs_what_a_scene_changes() -> None:
 def test_observations_without_their_scene_are_named(bad: np.ndarray) -> None:
     with pytest.raises(InvalidParameterError, match="gravity"):
         VariedPlanner(planner_of, VARIED).predict(bad)
+
+
+def test_evolution_of_all_scenes_together_recovers_the_inverse_in_each() -> None:
+    pytest.importorskip("cma")
+    observations, _ = questions(5)
+    looked = []
+
+    def land(stretches: np.ndarray, values: np.ndarray) -> np.ndarray:
+        looked.append(len(stretches))
+        return alike_throw(torch.from_numpy(stretches), torch.from_numpy(values)).numpy()
+
+    stored, values = sample_stretches(500, 0), np.random.default_rng(2).uniform(*VARIED.bounds(), (500, 2))
+    start = VariedPlanner(NearestVariedHops(stored, land(stored, values), values, VARIED).at, VARIED)
+    looked.clear()
+    stretches, _ = VariedEvolution(land, start, EvolutionConfig(evaluations=400), VARIED).predict(observations)
+    assert missed(observations, stretches).max() < 1e-3
+    assert missed(observations, start.predict(observations)[0]).max() > 1e-2
+    assert sum(looked) == 5 * 400
+
+
+def rough_hops(net: HopNet, count: int, seed: int) -> tuple[HopData, np.ndarray]:
+    """Hops that the net misses by waves, rough in the stretches, whose height changes slowly with gravity; and what it misses."""
+    rng = np.random.default_rng(seed)
+    stretches, values = sample_stretches(count, seed), rng.uniform(*VARIED.bounds(), (count, 2))
+    images = stretches[:, net.permutations.numpy()]
+    wave = np.stack([np.sin(20 * images[..., 0]), np.cos(15 * images[..., 1])], axis=2)
+    height = 0.02 + 0.015 * unit_values(values, VARIED)[:, :1]
+    residual = height * (wave * net.signs[:, :2].numpy()).mean(axis=1)
+    with torch.no_grad():
+        inputs = (torch.from_numpy(a.astype(np.float32)) for a in (stretches, values))
+        smooth = FrozenLanding(net, VARIED.observed)(*inputs).mean(dim=0).numpy()
+    columns = {
+        "stretches": stretches,
+        "landing": smooth + residual,
+        "scene_gravity": values[:, 0],
+        "scene_friction": values[:, 1],
+    }
+    return HopData(columns | {"index": np.arange(count)}, {}), residual
+
+
+def test_kriging_of_many_scenes_finds_what_the_net_misses_in_each() -> None:
+    torch.manual_seed(0)
+    net = HopNet(NetConfig(hidden=(8, 8), members=2), *scene_symmetries(Lattice(2, 2), Scene()), Scene(), dict(VARIED.ranges))
+    net.output_scale.copy_(torch.linspace(0.1, 0.9, len(net.output_scale)))
+    data, _ = rough_hops(net.eval(), 4000, 0)
+    shares = np.random.default_rng(1).random(4000)
+    split = {"train": np.flatnonzero(shares > 0.1), "validation": np.flatnonzero(shares <= 0.1)}
+    kriging = fit_varied_kriging(net, data, VARIED, split, 0.0)
+    assert kriging is not None
+    unseen, residual = rough_hops(net, 400, 9)
+    points, values = torch.from_numpy(unseen["stretches"].astype(np.float32)), scene_values(unseen, VARIED)
+    shifts = [kriging.at(values[k])(points[k : k + 1]) for k in range(400)]
+    left = residual - np.concatenate([shift.numpy() for shift, _ in shifts])
+    assert np.sqrt((left**2).mean()) < 0.4 * np.sqrt((residual**2).mean())
+    variance = np.array([doubt.item() for _, doubt in shifts])
+    assert np.sqrt(variance.mean()) == pytest.approx(np.sqrt((left**2).mean()), rel=0.4)
+    # groups of close stretches are corrected as each alone is, but for their having the first one's neighbours
+    group, doubt = kriging.at(values[0])(points[:1].expand(1, 3, 4))
+    np.testing.assert_allclose(group[0, 1].numpy(), shifts[0][0][0].numpy(), atol=1e-6)
+    assert doubt.shape == (1, 3)
+    few = {"train": np.arange(1), "validation": np.arange(1)}
+    assert fit_varied_kriging(net, data.rows(slice(0, 2)), VARIED, few, 0.0) is None

@@ -92,20 +92,26 @@ def fit_kriging(net: HopNet, data: HopData, validation: float, test: float, floo
     ``validation`` and ``test`` are the shares that the net was trained with, ``floor`` how far a landing moves, in each
     direction, when nothing but the unknowable changes [m].
     """
-    split = data.split(validation, test)
-    known, held = split["train"], split["validation"][:MOST_HELD]
-    if len(known) < 2 or len(held) < 2:
-        return None
     stretches = data["stretches"]
     residuals = data["landing"] - net.landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy()
     images = net.permutations.numpy(), net.signs[:, :2].numpy().astype(np.float64)
+    return fit_process(stretches, residuals, images, data.split(validation, test), floor)
+
+
+def fit_process(
+    points: Floats, residuals: Floats, images: tuple[np.ndarray, np.ndarray], split: dict[str, np.ndarray], floor: float
+) -> Kriging | None:
+    """As :func:`fit_kriging`, of residuals (n, 2) [m] at any points (n, d), whose images are permutations and signs."""
+    known, held = split["train"], split["validation"][:MOST_HELD]
+    if len(known) < 2 or len(held) < 2:
+        return None
     noise = max(LEAST_NOISE, float(floor**2 / np.mean(residuals[held] ** 2)))
     found = []
     for length in LENGTHS:
-        process = Kriging(stretches[known], residuals[known], *images, Scale(length, noise, 1.0, 0.0))
-        shift, share = process.shift(stretches[held])
+        process = Kriging(points[known], residuals[known], *images, Scale(length, noise, 1.0, 0.0))
+        shift, share = process.shift(points[held])
         share = share[:, None] + noise
         sigma = float(np.sqrt(((residuals[held] - shift) ** 2 / share).mean()))  # the likeliest, in closed form
         found.append(Scale(length, noise, sigma, float(np.log(sigma**2 * share).mean())))
     rows = np.sort(np.concatenate([known, split["validation"]]))
-    return Kriging(stretches[rows], residuals[rows], *images, min(found, key=lambda scale: scale.log_loss))
+    return Kriging(points[rows], residuals[rows], *images, min(found, key=lambda scale: scale.log_loss))

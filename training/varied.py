@@ -9,11 +9,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.optimize import nnls
 from scipy.spatial import KDTree
+from torch import Tensor
 
+from surrogate.dataset import HopData
+from surrogate.model import HopNet, one_thread
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
+from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.frozen import FrozenLanding
+from training.kriging import Kriging, fit_process
 from training.planner import NearestHopPlanner, Planner, Prediction
 from training.similarity import alike
 
@@ -49,6 +56,44 @@ class VariedPlanner:
         return np.concatenate(parts)[np.argsort(np.concatenate(rows))]
 
 
+class VariedEvolution:
+    """CMA-ES from another planner's answers; the searches of all scenes advance together.
+
+    ``land``: stretches (n, n_actuators) and the scene values of each (n, k) [SI] to landings as they would be on Earth (n, 2)
+    [m].
+    """
+
+    def __init__(
+        self, land: Callable[[Floats, Floats], Floats], start: Planner, config: EvolutionConfig, scenes: SceneRanges
+    ) -> None:
+        self.land, self.start, self.config, self.scenes = land, start, config, scenes
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Prediction:
+        """Observations (2 + k,) or (n, 2 + k) to stretches (4,) or (n, 4)."""
+        targets, values = alike(observation, self.scenes)
+
+        def land(stretches: Floats) -> Floats:
+            return self.land(stretches, np.repeat(values, len(stretches) // len(values), axis=0))
+
+        search = EvolutionPlanner(land, _Given(self.start.predict(np.atleast_2d(observation))[0]), self.config)
+        found, _ = search.predict(targets)
+        return (found[0] if np.ndim(observation) == 1 else found), state
+
+
+class _Given:
+    """Answers that are known already."""
+
+    def __init__(self, stretches: Floats) -> None:
+        self.stretches = stretches
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Prediction:
+        return self.stretches, state
+
+
 class ScaledScenes:
     """A planner that is told scenes itself: targets as they would be on Earth [m], then scene values from -1 to 1."""
 
@@ -64,19 +109,39 @@ class ScaledScenes:
         return (found[0] if np.ndim(observation) == 1 else found), state
 
 
+def scene_values(data: HopData, scenes: SceneRanges) -> Floats:
+    """Scene values of stored hops in observed order, shape (n, k) [SI]."""
+    return np.column_stack([data[f"scene_{name}"] for name in scenes.observed])
+
+
 def unit_values(values: Floats, scenes: SceneRanges) -> Floats:
     """Scene values (n, k) [SI] from -1 to 1 over their ranges."""
     low, high = scenes.bounds()
     return (np.asarray(values, dtype=np.float64) - (low + high) / 2) / ((high - low) / 2)
 
 
+def variogram(stretches: Floats, landings: Floats, values: Floats) -> tuple[float, Floats]:
+    """Squared distance of two hops' landings per squared difference of their stretches [m^2], and of each scene value.
+
+    Of hops with nearly the same stretches, fitted, with a constant, by non-negative least squares; arrays (n, n_actuators),
+    (n, 2) [m] and, from -1 to 1, (n, k).
+    """
+    count = min(NEIGHBOURS + 1, len(stretches))
+    if count < 2:
+        return 0.0, np.zeros(values.shape[1])
+    near = KDTree(stretches).query(stretches, count)[1][:, 1:]  # the first is the hop itself
+    apart = ((stretches[near] - stretches[:, None]) ** 2).sum(axis=2).reshape(-1, 1)
+    strange = ((values[near] - values[:, None]) ** 2).reshape(-1, values.shape[1])
+    moved = ((landings[near] - landings[:, None]) ** 2).sum(axis=2).reshape(-1)
+    _, slope, *weights = nnls(np.column_stack([np.ones(len(apart)), apart, strange]), moved)[0]
+    return float(slope), np.array(weights)
+
+
 class NearestVariedHops:
     """Stored hops of many scenes: for each scene the planner that repeats one of them.
 
     The squared error to expect of repeating a hop is its landing's squared distance to the target plus what being of another
-    scene costs: ``weights`` (k,) [m^2] times the squared differences of the scene values, ranges being 2 long. These weights are
-    read off the stored hops themselves: how far apart hops with nearly the same stretches landed, squared, is fitted by a
-    constant and multiples of the squared differences of stretches and scene values (non-negative least squares).
+    scene costs, as the :func:`variogram` of these hops has it.
 
     Args:
         stretches: shape (n, n_actuators).
@@ -87,19 +152,40 @@ class NearestVariedHops:
     def __init__(self, stretches: Floats, landings: Floats, values: Floats, scenes: SceneRanges) -> None:
         self.stretches, self.landings, self.scenes = stretches, landings, scenes
         self.values = unit_values(values, scenes)
-        self.weights = self._fitted()
+        self.weights = variogram(stretches, landings, self.values)[1]
 
     def at(self, values: Floats) -> NearestHopPlanner:
         """The planner of one scene, of ``values`` (k,) [SI]."""
         away = (self.values - unit_values(values[None], self.scenes)) ** 2
         return NearestHopPlanner(self.stretches, self.landings, away @ self.weights)
 
-    def _fitted(self) -> Floats:
-        count = min(NEIGHBOURS + 1, len(self.stretches))
-        if count < 2:
-            return np.zeros(self.values.shape[1])
-        near = KDTree(self.stretches).query(self.stretches, count)[1][:, 1:]  # the first is the hop itself
-        apart = ((self.stretches[near] - self.stretches[:, None]) ** 2).sum(axis=2).reshape(-1, 1)
-        strange = ((self.values[near] - self.values[:, None]) ** 2).reshape(-1, self.values.shape[1])
-        moved = ((self.landings[near] - self.landings[:, None]) ** 2).sum(axis=2).reshape(-1)
-        return nnls(np.column_stack([np.ones(len(apart)), apart, strange]), moved)[0][2:]
+
+class VariedKriging:
+    """Kriging of what a net misses where scenes vary: a scene's difference counts as that of stretches that moves as much."""
+
+    def __init__(self, process: Kriging, weights: Floats, scenes: SceneRanges) -> None:
+        self.process, self.weights, self.scenes = process, weights, scenes
+
+    def at(self, values: Floats) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+        """The correction in the scene of ``values`` (k,) [SI]; see ``Kriging``."""
+        scene = torch.from_numpy(((unit_values(values[None], self.scenes) * self.weights)[0]).astype(np.float32))
+        return lambda s: self.process(torch.cat([s, scene.expand(*s.shape[:-1], len(scene))], dim=-1))
+
+
+@one_thread()
+@torch.no_grad()
+def fit_varied_kriging(
+    net: HopNet, data: HopData, scenes: SceneRanges, split: dict[str, np.ndarray], floor: float
+) -> VariedKriging | None:
+    """As ``fit_kriging``, of hops in scenes that vary, with lengths as they would be on Earth; None if there are too few."""
+    stretches, values = data["stretches"], scene_values(data, scenes)
+    inputs = (torch.from_numpy(a.astype(np.float32)) for a in (stretches, values))
+    residuals = data["landing"] - FrozenLanding(net, scenes.observed)(*inputs).mean(dim=0).numpy()
+    unit = unit_values(values, scenes)
+    slope, weights = variogram(stretches, data["landing"], unit)
+    weights = np.sqrt(weights / slope) if slope > 0 else np.ones(len(weights))
+    own, group = net.permutations.shape[1], len(net.permutations)
+    still = np.broadcast_to(np.arange(own, own + len(weights)), (group, len(weights)))
+    images = np.column_stack([net.permutations.numpy(), still]), net.signs[:, :2].numpy().astype(np.float64)
+    process = fit_process(np.column_stack([stretches, unit * weights]), residuals, images, split, floor)
+    return None if process is None else VariedKriging(process, weights, scenes)

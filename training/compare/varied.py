@@ -19,9 +19,8 @@ from tensegrity_gym.task import check_fidelity, reach
 from tensegrity_gym.types import Floats
 from training.compare.config import CompareConfig
 from training.compare.hops import VariedHops
-from training.compare.learn import mean_landing
 from training.compare.run import BLOCK, FLOOR_HOPS, Comparison
-from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.evolution import EvolutionConfig
 from training.frozen import FrozenLanding
 from training.inverse import InversePlanner, fit_energy
 from training.planner import BestOfPlanner, Planner
@@ -29,7 +28,10 @@ from training.refine import RefiningPlanner
 from training.similarity import alike_data, likeness
 from training.stages import Results
 from training.tandem import TandemPlanner
-from training.varied import NearestVariedHops, ScaledScenes, VariedPlanner
+from training.varied import NearestVariedHops, ScaledScenes, VariedEvolution, VariedPlanner, fit_varied_kriging, scene_values
+
+#: Descents per target, at least: starts are chosen by the net alone, which tells less of them than kriging in one scene does.
+STARTS = 32
 
 
 class VariedComparison(Comparison):
@@ -79,35 +81,44 @@ class VariedComparison(Comparison):
             asked = np.column_stack([np.zeros((FLOOR_HOPS, 2)), values])
             landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations, asked)
             distances = np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2)
-            return {"distances": distances.tolist(), "reaches": self._reaches(asked).tolist()}
+            factor = likeness(values, self.scenes.observed)
+            return {"distances": distances.tolist(), "reaches": self._reaches(asked).tolist(), "likeness": factor.tolist()}
 
         self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, work)
+
+    @property
+    def floor(self) -> float:
+        """As in one scene, of lengths as they would be on Earth [m]."""
+        found = self.stages.results["floor"]
+        alike = np.array(found["distances"]) * np.array(found["likeness"])[:, None]
+        return float(np.sqrt(np.mean(np.square(alike)) / 2))
 
     def _fit(self, net: HopNet, data: HopData, seed: int) -> VariedFitted:
         return VariedFitted(net, data, self.config, seed, self)
 
-    def land(self, values: Floats) -> Callable[[Floats], Floats]:
-        """Landings as they would be on Earth [m], in the scene of ``values`` (k,) [SI], of stretches (n, n_actuators)."""
-        asked = np.concatenate([[0.0, 0.0], values])[None]
-        factor = likeness(values[None], self.scenes.observed)[0]
-        return lambda stretches: factor * self.hops.land(stretches, np.repeat(asked, len(stretches), axis=0))
+    def land(self, stretches: Floats, values: Floats) -> Floats:
+        """Landings as they would be on Earth (n, 2) [m], of stretches (n, n_actuators) in scenes of ``values`` (n, k) [SI]."""
+        asked = np.column_stack([np.zeros((len(values), 2)), values])
+        return likeness(values, self.scenes.observed)[:, None] * self.hops.land(stretches, asked)
+
+    def _land_at(self, values: Floats) -> Callable[[Floats], Floats]:
+        return lambda stretches: self.land(stretches, np.repeat(values[None], len(stretches), axis=0))
 
     def _best(self, fitted: VariedFitted, tries: int) -> Planner:
-        return VariedPlanner(lambda values: BestOfPlanner(fitted.planner(values), self.land(values), tries), self.scenes)
+        return VariedPlanner(lambda values: BestOfPlanner(fitted.planner(values), self._land_at(values), tries), self.scenes)
 
     def _refining(self, fitted: VariedFitted, tries: int) -> Planner:
-        return VariedPlanner(lambda values: RefiningPlanner(fitted.planner(values), self.land(values), tries), self.scenes)
+        return VariedPlanner(lambda values: RefiningPlanner(fitted.planner(values), self._land_at(values), tries), self.scenes)
 
     def _search_of(self, data: HopData) -> Planner:
         hops = stored(data.rows(data.usable), self)
-        return VariedPlanner(lambda values: EvolutionPlanner(self.land(values), hops.at(values), self._search), self.scenes)
+        return VariedEvolution(self.land, VariedPlanner(hops.at, self.scenes), self._search, self.scenes)
 
 
 def stored(data: HopData, comparison: VariedComparison) -> NearestVariedHops:
     """The hops of ``data``, to be repeated in other scenes."""
     scenes = comparison.scenes
-    values = np.column_stack([data[f"scene_{name}"] for name in scenes.observed])
-    return NearestVariedHops(data["stretches"], data["landing"], values, scenes)
+    return NearestVariedHops(data["stretches"], data["landing"], scene_values(data, scenes), scenes)
 
 
 class VariedFitted:
@@ -118,6 +129,8 @@ class VariedFitted:
         self.comparison, self.scenes = comparison, comparison.scenes
         self.landing = FrozenLanding(net, self.scenes.observed)
         self.energy = fit_energy(self.data["stretches"], self.data["stored_energy"])
+        split = self.data.split(config.surrogate.validation, config.surrogate.test)
+        self.kriging = fit_varied_kriging(net, self.data, self.scenes, split, comparison.floor)
         #: What making each planner took beyond simulating and the surrogate [s].
         self.seconds: dict[str, float] = {}
         self._made: dict[str, Any] = {}
@@ -143,7 +156,11 @@ class VariedFitted:
 
     def planner(self, values: Floats) -> InversePlanner:
         """The robust planner of one scene, of ``values`` (k,) [SI]."""
-        return InversePlanner(self.landing.at(values), self.config.inverse, energy=self.energy, seed=self.seed)
+        settings = replace(self.config.inverse, starts=max(STARTS, self.config.inverse.starts))
+        planner = InversePlanner(self.landing.at(values), settings, energy=self.energy, seed=self.seed)
+        if self.kriging is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
+            planner.correction = self.kriging.at(values)
+        return planner
 
     def _of_one_net(self, values: Floats) -> InversePlanner:
         landing = self.landing.at(values)
@@ -168,10 +185,10 @@ class VariedFitted:
         return ScaledScenes(tandem, self.scenes)
 
     def _evolution(self) -> Planner:
-        search, hops = EvolutionConfig(evaluations=self.config.search, seed=self.seed), stored(self.data, self.comparison)
+        search = EvolutionConfig(evaluations=self.config.search, seed=self.seed)
+        return VariedEvolution(self._mean_landing, self["nearest"], search, self.scenes)
 
-        def make(values: Floats) -> EvolutionPlanner:
-            landing = self.landing.at(values)
-            return EvolutionPlanner(lambda s: mean_landing(landing, s), hops.at(values), search)
-
-        return VariedPlanner(make, self.scenes)
+    @torch.no_grad()
+    def _mean_landing(self, stretches: Floats, values: Floats) -> Floats:
+        inputs = (torch.from_numpy(a.astype(np.float32)) for a in (stretches, values))
+        return self.landing(*inputs).mean(dim=0).numpy().astype(np.float64)
