@@ -10,12 +10,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from surrogate import descent, model
-from surrogate.correction import fit_correction
+from surrogate import descent, evaluate, model
 from surrogate.dataset import COLUMNS, Configuration, HopData, split_share
 from surrogate.descent import Descent
 from surrogate.generate import sample_stretches
+from surrogate.kriging import fit_kriging
 from surrogate.model import OUTPUTS, HopNet, NetConfig
+from surrogate.outputs import LANDING
 from surrogate.scores import LEVELS, calibrate, coverage, of_data, rmse, spread
 from surrogate.train import TrainConfig, _start, train
 from tensegrity_gym import Lattice, Scene, simulate
@@ -90,9 +91,9 @@ def test_correction_repeats_stored_hops_stays_equivariant_and_doubts_what_is_far
     data = closed_form_data(120)
     net, _ = train(data, replace(QUICK, epochs=3), progress=False)  # hardly trained: much is left to correct
     unseen = closed_form_data(60, seed=9)
-    fitted = fit_correction(net, data, 0.1, 0.1)
-    assert fitted is not None
-    correction, scale = fitted
+    correction = fit_kriging(net, data, 0.1, 0.1)
+    assert correction is not None
+    scale = correction.scale
     split = data.split()
     with torch.no_grad():
         seen = torch.from_numpy(data["stretches"][split["train"]].astype(np.float32))
@@ -109,7 +110,11 @@ def test_correction_repeats_stored_hops_stays_equivariant_and_doubts_what_is_far
         for perm, signs in zip(LATTICE.symmetries, LATTICE.symmetry_signs, strict=True):
             image = correction(other[:, perm])[0] * torch.as_tensor(signs)
             torch.testing.assert_close(image, shift, rtol=0, atol=1e-3 * float(shift.abs().max()))
-    assert fit_correction(net, data.rows(slice(0, 1)), 0.1, 0.1) is None
+    assert fit_kriging(net, data.rows(slice(0, 1)), 0.1, 0.1) is None
+    tested = data.rows(split["test"])
+    left = np.linalg.norm(net.predict(tested["stretches"]).mean[:, LANDING] - tested["landing"], axis=1)
+    assert evaluate.mended(net, tested, data, (0.1, 0.1))["rms"] < 0.5 * np.sqrt((left**2).mean())
+    assert evaluate.mended(net, tested, data.rows(slice(0, 1)), (0.1, 0.1)) == {}
 
 
 def test_hops_that_lack_an_output_train_the_others() -> None:

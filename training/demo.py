@@ -11,9 +11,9 @@ import numpy as np
 from tqdm import tqdm
 
 from surrogate import dataset, model
-from surrogate.correction import fit_correction
 from surrogate.dataset import Configuration, HopData
 from surrogate.generate import generate
+from surrogate.kriging import fit_kriging
 from surrogate.storage import package_versions
 from surrogate.train import TrainConfig, train
 from tensegrity_gym import MODEL_VERSION, Scene, simulate
@@ -143,9 +143,9 @@ def _plans(stages: Stages, config: DemoConfig, data: HopData, held_out: HopData,
             known = known.rows(known.usable)
             net, _ = model.load(stages.folder / f"surrogate_{budget}.safetensors")
             started = time.perf_counter()
-            fitted = fit_correction(net, known, config.surrogate.validation, config.surrogate.test)
-            correction, scale = fitted or (None, None)
-            plans["correction"][str(budget)] = {"scale": scale and asdict(scale), "seconds": time.perf_counter() - started}
+            correction = fit_kriging(net, known, config.surrogate.validation, config.surrogate.test)
+            scale = None if correction is None else asdict(correction.scale)
+            plans["correction"][str(budget)] = {"scale": scale, "seconds": time.perf_counter() - started}
             planners: dict[str, Planner] = {
                 "nearest": NearestHopPlanner(known["stretches"], known["landing"]),
                 "planner": InversePlanner(

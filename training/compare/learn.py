@@ -14,6 +14,7 @@ from torch import Tensor
 
 from surrogate import dataset, model
 from surrogate.dataset import Configuration, HopData
+from surrogate.kriging import fit_kriging
 from surrogate.model import HopNet
 from surrogate.train import train
 from tensegrity_gym import Scene
@@ -24,7 +25,6 @@ from training.compare.hops import Hops
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.frozen import FrozenLanding
 from training.inverse import InversePlanner, fit_energy
-from training.kriging import fit_kriging
 from training.planner import NearestHopPlanner, Planner
 from training.tandem import TandemPlanner
 

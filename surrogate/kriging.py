@@ -1,9 +1,11 @@
 """What the surrogate misses, from the stored hops around each point: any number of hops, a few neighbours at a time.
 
-``surrogate.correction`` keeps one Gaussian process of all residuals, which a few hundred hops are the limit of. Landings are
-rough on a scale below the distance between thousands of hops, so only the nearest ones tell anything: here each point has
-a process of its own over these (Rasmussen and Williams 2006, eqs. 2.23-2.24 and section 8.3), with the Matérn kernel whose
-samples have one derivative (eq. 4.17), as the doubt about a landing grows in proportion to the way from a stored hop.
+A net is smooth, the landing is not, on a scale below the distance between thousands of hops. So near a stored hop its answer
+can be mended by what it missed there, and nothing else is known elsewhere: each point has a Gaussian process of its own over
+the residuals of the nearest hops and their images (Rasmussen and Williams 2006, eqs. 2.23-2.24 and section 8.3), with the
+Matérn kernel whose samples have one derivative (eq. 4.17), as the doubt about a landing grows in proportion to the way from a
+stored hop. A planner that minimises the expected squared error then neither strays from the hops where the landing is rough,
+nor clings to them where it is smooth.
 """
 
 from __future__ import annotations
