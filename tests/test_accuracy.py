@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import naive
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import bars, stability
+from benchmarks.accuracy import bars, floor, stability
 from benchmarks.accuracy.part import Options, Part, kept, table
 from benchmarks.accuracy.samples import hop_perturbed, stretches
 from benchmarks.accuracy.stepping import forces
@@ -118,6 +119,31 @@ def test_an_unknown_moves_a_hop_and_its_absence_does_not(kind: str) -> None:
     np.testing.assert_array_equal(still, same)
     assert (np.abs(moved - still) > 1e-9).all()
     assert (np.abs(moved - still) < 1e-2 * still).all()
+
+
+def test_floors_elsewhere_are_of_that_scene_once_in_full_and_once_with_rigid_flights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hops made up here: a perturbed one lands 3 and 4 mm away, in full, and 30 and 40 mm with a rigid flight."""
+    asked = []
+
+    def made_up(kind: str, seed: int, found: object, *, scene: Scene, fidelity: str, **_: object) -> SimpleNamespace:
+        asked.append((scene, fidelity))
+        n, moved = 4, kind != "none"
+        values = {name: np.full(n, 1.0 + 0.001 * moved) for name in floor.FIELDS} | {"status": np.zeros(n, int)}
+        offset = moved * np.array([0.003, 0.004]) * (10 if fidelity == "flown" else 1)
+        lands = dict.fromkeys(("touchdown", "rest"), np.arange(n)[:, None] + offset)
+        return SimpleNamespace(**values | lands | {"takeoff_velocity": np.ones((n, 3))})
+
+    monkeypatch.setattr(floor, "hop_perturbed", made_up)
+    monkeypatch.setattr(floor, "form_find", lambda *_, **__: None)
+    d = floor.measure_elsewhere(Options(quick=True, runs=tmp_path), "moon")
+    assert set(asked) == {(Scene.preset("moon"), "paper"), (Scene.preset("moon", landing="touchdown"), "flown")}
+    for kind in floor.KINDS:
+        np.testing.assert_allclose(d[f"{kind}/touchdown"], 0.005)
+        np.testing.assert_allclose(d[f"{kind}/rest"], 0.005)
+        np.testing.assert_allclose(d[f"rigid/{kind}"], 0.05)
+    assert [line.split() for line in floor.compare_flights(d)[2:]] == [[kind, *["10.00"] * 4] for kind in floor.KINDS]
 
 
 def test_measurements_are_kept_under_their_key_and_run_once(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from benchmarks.accuracy import (
 from benchmarks.accuracy.part import Options
 
 MODULES = (bars, reference, floor, sensitivity, growth, stability, limits, drops, rounding, damping, scenes, ladder, auto)
-PARTS = {module.PART.name: module.PART for module in MODULES}
+PARTS = {part.name: part for module in MODULES for part in (module.PART, *getattr(module, "OTHERS", ()))}
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ def hop_perturbed(
     design: Design,
     scene: Scene,
     precision: str = "float32",
+    fidelity: str = "paper",
     rate: float | None = None,
     size: float | None = None,
     lattice: Lattice | None = None,
@@ -41,7 +42,8 @@ def hop_perturbed(
     ``size`` replaces these numbers.
     """
     lattice = lattice or Lattice()
-    options = {"lattice": lattice, "scene": scene, "precision": precision, "trajectory_rate": rate, "threads": 1}
+    model = {"fidelity": fidelity, "precision": precision}
+    options = {"lattice": lattice, "scene": scene, "trajectory_rate": rate, "threads": 1, **model}
     rng = np.random.default_rng([seed, 99])
     if kind == "none":
         return simulate(found.stretches, design=design, equilibria=found, **options)  # type: ignore[arg-type]
