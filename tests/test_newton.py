@@ -85,25 +85,19 @@ def valley_tangent(problem, pattern, x, tensions, h):
         store(h, 0, k, entries[k])
 
 
-@jit(cache=False, forceinline=False, _nrt=True)
-def run_valley(problem, pattern, settings, stretches, records, lanes, work, n, count):
-    """Newton in the valley."""
-    find_minima(
-        valley,
-        valley_forces,
-        valley_tangent,
-        no_tensions,
-        problem,
-        pattern,
-        settings,
-        stretches,
-        records,
-        lanes,
-        work,
-        0,
-        n,
-        count,
-    )
+def newton_on(energy, forces, tangent):
+    """Newton on an energy without members, compiled."""
+
+    @jit(cache=False, forceinline=False, _nrt=True)
+    def run(problem, pattern, settings, stretches, records, lanes, work, n, count):
+        find_minima(
+            energy, forces, tangent, no_tensions, problem, pattern, settings, stretches, records, lanes, work, 0, n, count
+        )
+
+    return run
+
+
+run_valley = newton_on(valley, valley_forces, valley_tangent)
 
 
 @jit
@@ -123,25 +117,7 @@ def sunken_forces(problem, x, f):
     return sqrt(fx * fx + fy * fy + fz * fz)
 
 
-@jit(cache=False, forceinline=False, _nrt=True)
-def run_sunken(problem, pattern, settings, stretches, records, lanes, work, n, count):
-    """Newton in the valley that leads below the ground."""
-    find_minima(
-        sunken,
-        sunken_forces,
-        valley_tangent,
-        no_tensions,
-        problem,
-        pattern,
-        settings,
-        stretches,
-        records,
-        lanes,
-        work,
-        0,
-        n,
-        count,
-    )
+run_sunken = newton_on(sunken, sunken_forces, valley_tangent)
 
 
 # ------------------------------------------------------------------------------------- von Mises truss
@@ -187,12 +163,7 @@ def truss_tangent(problem, pattern, x, tensions, h):
         store(h, 0, k, entries[k])
 
 
-@jit(cache=False, forceinline=False, _nrt=True)
-def run_truss(problem, pattern, settings, stretches, records, lanes, work, n, count):
-    """Newton on the truss."""
-    find_minima(
-        truss, truss_forces, truss_tangent, no_tensions, problem, pattern, settings, stretches, records, lanes, work, 0, n, count
-    )
+run_truss = newton_on(truss, truss_forces, truss_tangent)
 
 
 # ------------------------------------------------------------------------------------- tests

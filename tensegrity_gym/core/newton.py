@@ -21,7 +21,14 @@ from tensegrity_gym.core.cholesky import factorise, solve
 from tensegrity_gym.core.forces import dot
 from tensegrity_gym.core.jit import jit
 from tensegrity_gym.core.lanes import load, load1, select, splat, sqrt, store, store1
-from tensegrity_gym.core.statics import Statics, predict_tensions, static_energy, static_forces, static_tangent
+from tensegrity_gym.core.statics import (
+    Statics,
+    change_held_masses,
+    predict_tensions,
+    static_energy,
+    static_forces,
+    static_tangent,
+)
 
 
 class NewtonSettings(NamedTuple):
@@ -171,23 +178,6 @@ def load_increment(stretches, settings):
     return min(1.0, settings.load_step / largest)
 
 
-@jit(forceinline=False)
-def change_held(settings, lanes, lane):
-    """At an equilibrium: hold what sank, let go what is pulled up. Returns whether anything changed."""
-    changed = False
-    for i in range(lanes.x.shape[0]):
-        if lanes.held[i, lane] == 0.0 and lanes.x[i, 2, lane] < 0.0:
-            lanes.held[i, lane] = 1.0
-            lanes.x[i, 2, lane] = 0.0
-            changed = True
-        elif lanes.held[i, lane] > 0.0 and lanes.f[i, 2, lane] > settings.tolerance:
-            lanes.held[i, lane] = 0.0
-            changed = True
-    if changed:
-        lanes.rounds[lane] += 1
-    return changed
-
-
 ITERATE, MOVED, FOUND, GIVEN_UP = 0, 1, 2, 3
 
 
@@ -207,7 +197,8 @@ def next_stage(settings, lanes, lane, stretches):
         return ITERATE
     if lanes.rounds[lane] >= settings.max_rounds:
         return GIVEN_UP
-    if change_held(settings, lanes, lane):
+    if change_held_masses(lanes.held, lanes.x, lanes.f, settings.tolerance, lane):
+        lanes.rounds[lane] += 1
         return MOVED
     return FOUND if residual < settings.tolerance else ITERATE
 
