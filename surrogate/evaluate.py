@@ -12,7 +12,7 @@ import tyro
 
 from surrogate import dataset, model
 from surrogate.dataset import SPLITS, HopData
-from surrogate.kriging import fit_kriging
+from surrogate.kriging import fit_process
 from surrogate.model import HopNet
 from surrogate.outputs import OUTPUTS, target_columns
 from surrogate.scores import LEVELS, PLANES, coverage, disagreement, nearest_hop_noise, of_data, ranking, rmse, speed, spread
@@ -57,22 +57,30 @@ class Evaluation:
     distance: dict[str, dict[str, float]]
     reach: dict[str, float]
     speed: dict[str, Any]
-    mended: dict[str, float] = field(default_factory=dict)
+    mended: dict[str, dict[str, float]] = field(default_factory=dict)
     floor: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
-def mended(net: HopNet, rows: HopData, whole: HopData, shares: tuple[float, float]) -> dict[str, float]:
-    """Errors of the landing on the test hops ``rows``, corrected by what the net misses on the others; empty if too few.
+def mended(net: HopNet, rows: HopData, whole: HopData, shares: tuple[float, float]) -> dict[str, dict[str, float]]:
+    """Errors on the test hops ``rows``, by name as in PLANES, corrected by what the net misses on the others near them.
 
-    ``shares``: of validation and test hops, as the net was trained with.
+    ``shares``: of validation and test hops, as the net was trained with. Empty where hops are too few.
     """
-    process = fit_kriging(net, whole.rows(whole.usable), *shares)
-    if process is None:
-        return {}
-    with torch.no_grad():
-        stretches = torch.from_numpy(rows["stretches"].astype(np.float32))
-        landing = (net.landing(stretches).mean(dim=0) + process(stretches)[0]).numpy()
-    return _quantiles(np.linalg.norm(landing - rows["landing"], axis=1))
+    found = {}
+    for name, plane in PLANES.items():
+        data = whole.rows(whole.usable & np.isfinite(whole[name]).all(axis=1))
+        images = net.permutations.numpy(), net.signs[:, plane].numpy().astype(np.float64)
+        process = fit_process(data["stretches"], data[name] - _seen(net, data, plane), images, data.split(*shares), 0.0)
+        if process is not None:
+            error = rows[name] - _seen(net, rows, plane) - process.shift(rows["stretches"])[0]
+            found[name] = _quantiles(np.linalg.norm(error, axis=1))
+    return found
+
+
+@torch.no_grad()
+def _seen(net: HopNet, rows: HopData, plane: tuple[int, int]) -> Floats:
+    """Two outputs of the ensemble, shape (n, 2) [m]."""
+    return net(torch.from_numpy(rows["stretches"].astype(np.float32))).mean(dim=0)[:, plane].numpy()
 
 
 def _quantiles(error: Floats) -> dict[str, float]:
@@ -152,10 +160,10 @@ def table(found: Evaluation) -> str:
             f"{100 * values['rms'] / found.reach[name]:.1f} % of reach ({found.reach[name]:.3f} m); Spearman of error with "
             + ", ".join(f"{kind} {value:.2f}" for kind, value in found.ranking[name].items())
         )
-    if found.mended:
+    for name, values in found.mended.items():
         lines.append(
-            f"landing mended by the hops stored nearby: rms {1e3 * found.mended['rms']:.2f} mm, median "
-            f"{1e3 * found.mended['p50']:.2f}, 90 % {1e3 * found.mended['p90']:.2f}"
+            f"{name} error, mended by the hops stored nearby: rms {1e3 * values['rms']:.2f} mm, "
+            f"median {1e3 * values['p50']:.2f}, 90 % {1e3 * values['p90']:.2f}"
         )
     member, whole = (found.speed[f"predictions_per_second_{k}"] for k in ("member", "ensemble"))
     lines.append(

@@ -113,7 +113,7 @@ def test_correction_repeats_stored_hops_stays_equivariant_and_doubts_what_is_far
     assert fit_kriging(net, data.rows(slice(0, 1)), 0.1, 0.1) is None
     tested = data.rows(split["test"])
     left = np.linalg.norm(net.predict(tested["stretches"]).mean[:, LANDING] - tested["landing"], axis=1)
-    assert evaluate.mended(net, tested, data, (0.1, 0.1))["rms"] < 0.5 * np.sqrt((left**2).mean())
+    assert evaluate.mended(net, tested, data, (0.1, 0.1))["landing"]["rms"] < 0.5 * np.sqrt((left**2).mean())
     assert evaluate.mended(net, tested, data.rows(slice(0, 1)), (0.1, 0.1)) == {}
 
 
