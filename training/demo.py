@@ -18,15 +18,23 @@ from surrogate.storage import package_versions
 from surrogate.train import TrainConfig, train
 from tensegrity_gym import MODEL_VERSION, Scene, simulate
 from tensegrity_gym.errors import InvalidParameterError
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.task import reach
 from training import figures, report
 from training.inverse import InverseConfig, InversePlanner
 from training.planner import NearestHopPlanner, Planner
 from training.policies import ActorPolicy
+from training.refine import RefiningPlanner
 from training.score import Score, score_stretches
 from training.stages import Results, Stages
 
-METHODS = {"nearest": "nearest stored hop", "planner": "planner (surrogate inverted)", "policy": "policy (SAC)"}
+TURNS = 8  #: hops that are simulated for each answer of the planner that corrects itself
+METHODS = {
+    "nearest": "nearest stored hop",
+    "planner": "planner (surrogate inverted)",
+    "turns": f"planner, {TURNS} hops in turn",
+    "policy": "policy (SAC)",
+}
 HELD_OUT_SEED = 1_000_003  #: added to the seed for the hops that targets are taken from
 SHOWN_HOP = (0.3, 0.3, 0.5, 0.5)  #: stretches of the hop in the pictures
 
@@ -73,7 +81,7 @@ def run(config: DemoConfig) -> Stages:
     held_out = held_out.rows(held_out.usable)
     for budget in budgets:
         _surrogate(stages, config, data, held_out, budget)
-    _plans(stages, config, data, held_out, budgets)
+    _plans(stages, config, scene, data, held_out, budgets)
     _policy(stages, config, scene, held_out, budgets)
     _evaluation(stages, config, scene, held_out, budgets)
     _report(stages, config, scene, data, held_out, budgets)
@@ -135,9 +143,13 @@ def _surrogate(stages: Stages, config: DemoConfig, data: HopData, held_out: HopD
     stages.run(name, settings, work, needs=["data", "targets"], files=[path.name, path.with_suffix(".json").name])
 
 
-def _plans(stages: Stages, config: DemoConfig, data: HopData, held_out: HopData, budgets: list[int]) -> None:
+def _plans(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, held_out: HopData, budgets: list[int]) -> None:
+    def land(stretches: np.ndarray) -> np.ndarray:
+        result = simulate(stretches, scene=scene, fidelity=Fidelity(flight="rigid", stop="landing"))
+        return np.where(result.failed[:, None], np.nan, result.landing)
+
     def work() -> Results:
-        plans: Results = {"nearest": {}, "planner": {}, "correction": {}}
+        plans: Results = {"nearest": {}, "planner": {}, "turns": {}, "correction": {}}
         for budget in tqdm(budgets, desc="plans", unit="budget", disable=not config.progress):
             known = data.rows(slice(0, budget))
             known = known.rows(known.usable)
@@ -146,12 +158,15 @@ def _plans(stages: Stages, config: DemoConfig, data: HopData, held_out: HopData,
             correction = fit_kriging(net, known, config.surrogate.validation, config.surrogate.test)
             scale = None if correction is None else asdict(correction.scale)
             plans["correction"][str(budget)] = {"scale": scale, "seconds": time.perf_counter() - started}
+            inverse = InversePlanner(
+                net.landing, config.planner, correction=correction, stored=known["stretches"], seed=config.seed
+            )
             planners: dict[str, Planner] = {
                 "nearest": NearestHopPlanner(known["stretches"], known["landing"]),
-                "planner": InversePlanner(
-                    net.landing, config.planner, correction=correction, stored=known["stretches"], seed=config.seed
-                ),
+                "planner": inverse,
             }
+            if budget == config.hops:
+                planners["turns"] = RefiningPlanner(inverse, land, TURNS)
             for method, planner in planners.items():
                 started = time.perf_counter()
                 stretches, _ = planner.predict(held_out["landing"])
@@ -162,7 +177,8 @@ def _plans(stages: Stages, config: DemoConfig, data: HopData, held_out: HopData,
             plans["nearest"][str(budget)]["landings"] = known["landing"][stored].tolist()
         return plans
 
-    stages.run("plans", {"planner": asdict(config.planner), "seed": config.seed}, work, needs=[f"surrogate_{b}" for b in budgets])
+    settings = {"planner": asdict(config.planner), "turns": TURNS, "seed": config.seed, "scene": asdict(scene)}
+    stages.run("plans", settings, work, needs=[f"surrogate_{b}" for b in budgets])
 
 
 def _policy(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData, budgets: list[int]) -> None:
@@ -190,7 +206,7 @@ def _evaluation(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopD
     answers = dict(stages.results["plans"]) | {"policy": stages.results["policy"]["answers"]}
 
     def work() -> Results:
-        asked = [(method, str(budget)) for method in ("planner", "policy") for budget in budgets]
+        asked = [(method, budget) for method in METHODS if method != "nearest" for budget in answers[method]]
         stretches = np.concatenate([np.array(answers[method][budget]["stretches"]) for method, budget in asked])
         targets = np.tile(held_out["landing"], (len(asked), 1))
         with tqdm(total=len(targets), desc="simulating the answers", unit="hop", disable=not config.progress) as bar:
@@ -215,8 +231,10 @@ def table_rows(stages: Stages, config: DemoConfig, scene: Scene, n_targets: int)
         + stages.results["plans"]["correction"][whole]["seconds"],
         "policy": stages.seconds["policy"],
     }
+    training["turns"] = training["planner"]
     answers = dict(stages.results["plans"]) | {"policy": stages.results["policy"]["answers"]}
-    calls = {"nearest": config.hops, "planner": config.hops, "policy": stages.results["policy"]["simulator_calls"]}
+    calls = {"nearest": config.hops, "planner": config.hops, "turns": config.hops + TURNS * n_targets}
+    calls |= {"policy": stages.results["policy"]["simulator_calls"]}
     rows = []
     for method, label in METHODS.items():
         found = Score.from_dict(stages.results["evaluation"][method][whole])
@@ -236,7 +254,7 @@ def table_rows(stages: Stages, config: DemoConfig, scene: Scene, n_targets: int)
 def _report(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, held_out: HopData, budgets: list[int]) -> None:
     def work() -> Results:
         folder, results = stages.folder, stages.results
-        scores = {m: {b: Score.from_dict(results["evaluation"][m][str(b)]) for b in budgets} for m in METHODS}
+        scores = {m: {int(b): Score.from_dict(s) for b, s in results["evaluation"][m].items()} for m in METHODS}
         predicted = np.array(results[f"surrogate_{config.hops}"]["predicted"])
         figures.landing_map(data.rows(data.usable), folder / "landing_map.png")
         figures.predicted_against_simulated(predicted, held_out, folder / "scatter.png")

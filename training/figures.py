@@ -125,7 +125,7 @@ def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
             ax.plot(*np.stack([targets, found.landings]).transpose(2, 0, 1), color="#999999", lw=0.9)
             ax.plot(*targets.T, "o", mfc="none", mec="black", ms=6, label="target")
             ax.plot(*found.landings.T, ".", color=COLOURS[k], ms=8, label="landing")
-            ax.set(title=f"{label}\nmedian error {np.median(found.errors):.3f} m", xlabel="x [m]", aspect="equal")
+            ax.set(title=f"{label}\nmedian error {1e3 * np.median(found.errors):.2g} mm", xlabel="x [m]", aspect="equal")
             ax.title.set_fontsize(11)
         np.atleast_1d(axes)[0].set(ylabel="y [m]")
         np.atleast_1d(axes)[0].legend(loc="best", fontsize=9)
@@ -148,7 +148,7 @@ def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float,
             low, middle, high = np.array([np.quantile(by_calls[c].errors, (0.25, 0.5, 0.75)) for c in calls]).T
             axes.plot(calls, middle, "o-", color=COLOURS[k], label=label)
             axes.fill_between(calls, np.maximum(low, 1e-6), high, color=COLOURS[k], alpha=0.13, lw=0)
-        axes.set(xscale="log", yscale="log", xlabel="simulator calls", ylabel="landing error [m]")
+        axes.set(xscale="log", yscale="log", xlabel="simulator calls learnt from", ylabel="landing error [m]")
         axes.set_xticks(calls, [str(c) for c in calls])
         axes.minorticks_off()
         right = axes.secondary_yaxis("right", functions=(percent, metres))

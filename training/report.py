@@ -12,8 +12,8 @@ from surrogate.storage import atomic_path
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("method", "method", "s"),
-    ("median_error", "median error [m]", ".3f"),
-    ("mean_error", "mean error [m]", ".3f"),
+    ("median_error", "median error [m]", ".4f"),
+    ("mean_error", "mean error [m]", ".4f"),
     ("median_percent", "median [% of reach]", ".1f"),
     ("mean_percent", "mean [% of reach]", ".1f"),
     ("failed_percent", "failed [%]", ".0f"),
@@ -80,7 +80,8 @@ def write(
         "Wall time is all a method needs before its last answer: simulating its hops, training, answering. Per answer: a "
         "batch's time over its targets. Targets are landings of other simulated hops, which no method learnt from. A stored "
         "hop repeats bit by bit in simulation, where nothing scatters its start: that flatters the nearest stored hop "
-        "wherever landings are chaotic."
+        "wherever landings are chaotic. Hops in turn are simulated for each answer, with a cheaper model that flies "
+        "rigidly and ends where the landing is read, and counted; all answers are scored on the paper's."
     )
     page = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tensegrity hop demo</title><style>{STYLE}</style>',
