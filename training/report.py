@@ -80,8 +80,8 @@ def write(
         "Wall time is all a method needs before its last answer: simulating its hops, training, answering. Per answer: a "
         "batch's time over its targets. Targets are landings of other simulated hops, which no method learnt from. A stored "
         "hop repeats bit by bit in simulation, where nothing scatters its start: that flatters the nearest stored hop "
-        "wherever landings are chaotic. Hops in turn are simulated for each answer, with a cheaper model that flies "
-        "rigidly and ends where the landing is read, and counted; all answers are scored on the paper's."
+        "wherever landings are chaotic. Hops in turn are simulated for each answer, and counted; touchdowns by a "
+        "cheaper model, which flies rigidly and ends there. All answers are scored on the paper's model."
     )
     page = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tensegrity hop demo</title><style>{STYLE}</style>',
