@@ -102,14 +102,15 @@ class InversePlanner:
         stretches = self.plan(targets_of(observation)).stretches
         return (stretches[0] if np.ndim(observation) == 1 else stretches), state
 
+    @one_thread()
+    @torch.no_grad()
     def plan(self, targets: np.ndarray) -> Plans:
         """Answers to targets (n, 2) [m], with what is expected of them."""
         goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))
         found, cost = self._search(goal, self.config.starts)
         best = cost.argmin(dim=1) if self.energy is None else self._least_energy(found, cost)
         rows = torch.arange(len(best))
-        with torch.no_grad():
-            landings = self.see(found[rows, best])[0]
+        landings = self.see(found[rows, best])[0]
         nearest = torch.linalg.norm(landings - goal, dim=1)
         errors = torch.sqrt(cost[rows, best])
         return Plans(_in_range(found[rows, best]), landings.numpy(), errors.numpy(), (nearest <= self.config.miss).numpy())

@@ -14,7 +14,7 @@ from torch import Tensor
 from surrogate import dataset
 from surrogate.dataset import Configuration, HopData
 from surrogate.generate import fill, sample_stretches
-from surrogate.model import HopNet
+from surrogate.model import HopNet, one_thread
 from tensegrity_gym.task import check_fidelity, reach
 from tensegrity_gym.types import Floats
 from training.compare.config import CompareConfig
@@ -154,6 +154,7 @@ class VariedFitted:
         """The robust planner, which others build on."""
         return self["ensemble"]
 
+    @one_thread()
     def planner(self, values: Floats) -> InversePlanner:
         """The robust planner of one scene, of ``values`` (k,) [SI]."""
         settings = replace(self.config.inverse, starts=max(STARTS, self.config.inverse.starts))
@@ -162,6 +163,7 @@ class VariedFitted:
             planner.correction = self.kriging.at(values)
         return planner
 
+    @one_thread()
     def _of_one_net(self, values: Floats) -> InversePlanner:
         landing = self.landing.at(values)
         return InversePlanner(lambda s: landing(s)[:1], self.config.inverse)
