@@ -13,12 +13,12 @@ import torch
 
 from surrogate import dataset
 from surrogate.dataset import HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.model import NetConfig
 from surrogate.train import TrainConfig, train
 from tensegrity_gym.task import reach
 from training.compare.hops import VariedHops
 from training.compare.targets import scenes_of
-from training.frozen import FrozenLanding
 from training.similarity import alike_data, likeness
 from training.varied import scene_values
 

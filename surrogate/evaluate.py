@@ -165,10 +165,13 @@ def table(found: Evaluation) -> str:
             f"{name} error, mended by the hops stored nearby: rms {1e3 * values['rms']:.2f} mm, "
             f"median {1e3 * values['p50']:.2f}, 90 % {1e3 * values['p90']:.2f}"
         )
-    member, whole = (found.speed[f"predictions_per_second_{k}"] for k in ("member", "ensemble"))
+    for what in ("predictions", "landings"):
+        member, whole = (found.speed[f"{what}_per_second_{k}"] for k in ("member", "ensemble"))
+        lines.append(f"a second of one core: {member:.3g} {what} of one member, {whole:.3g} of all")
+    machine, threads = found.speed["landings_per_second_machine"], found.speed["threads"]
     lines.append(
-        f"a second of one core: {member:.3g} predictions of one member, {whole:.3g} of all; a single one takes "
-        f"{found.speed['single_milliseconds']:.2f} ms"
+        f"a second by the clock, {threads} threads: {machine:.3g} landings of all; "
+        f"a single prediction takes {found.speed['single_milliseconds']:.2f} ms"
     )
     return "\n".join(lines)
 

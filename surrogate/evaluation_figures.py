@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.ticker import EngFormatter, FormatStrFormatter, LogLocator, NullFormatter
 
 from surrogate.dataset import HopData
 from surrogate.figures import COLOURS, STYLE, Figure, plt
@@ -133,13 +134,17 @@ def nets(cells: dict[str, Any]) -> Figure:
         depths = sorted({len(c["hidden"]) for c in cells.values()})
         for k, depth in enumerate(depths):
             chosen = sorted((c for c in cells.values() if len(c["hidden"]) == depth), key=lambda c: c["hidden"])
-            rate = [c["speed"]["predictions_per_second_member"] for c in chosen]
+            rate = [c["speed"]["landings_per_second_member"] for c in chosen]
             error = [1e3 * c["rms_distance"][name] for c in chosen]
             axis.loglog(rate, error, "o-", color=COLOURS[k], label=f"{depth} hidden layers")
             for c, x, y in zip(chosen, rate, error, strict=True):
                 axis.annotate(str(c["hidden"][0]), (x, y), textcoords="offset points", xytext=(4, 4), fontsize=8)
         axis.axvline(1e6, color="0.5", lw=1, ls=":")
-        axis.set(xlabel="predictions of one member in a second of one core", ylabel="rms error of test hops [mm]", title=name)
+        for each, form in ((axis.xaxis, EngFormatter()), (axis.yaxis, FormatStrFormatter("%g"))):
+            each.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+            each.set_major_formatter(form)
+            each.set_minor_formatter(NullFormatter())
+        axis.set(xlabel="landings of one member in a second of one core", ylabel="rms error of test hops [mm]", title=name)
         axis.legend()
     return figure
 

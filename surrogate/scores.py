@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.special import ndtri
 from scipy.stats import spearmanr
 
 from surrogate.dataset import HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.model import HopNet, Prediction, one_thread
 from surrogate.outputs import OUTPUTS, scene_columns, target_columns
 from tensegrity_gym import STRETCH_RANGE, Lattice
@@ -134,32 +136,40 @@ def nearest_hop_noise(data: HopData, pairs: int = 8) -> dict[str, float]:
     return found
 
 
-@one_thread()
 @torch.no_grad()
 def speed(net: HopNet, batch: int = 4096, seconds: float = 1.0) -> dict[str, Any]:
-    """Predictions per second of one core in batches, of one member and of all, and its milliseconds for a single one.
+    """Predictions per second in batches, of one member and of all, and milliseconds for a single one.
 
-    The core's time is counted, not the clock's, so that other work on the machine does not count.
+    Predictions are of all outputs and their scatter; landings are what planners ask for, of ``FrozenLanding``
+    (not-a-number where the net is told a slope). Of one core its own time is counted, not the clock's, so that other work
+    on the machine does not count; ``landings_per_second_machine`` is by the clock, with as many threads as torch has.
     """
     low, high = STRETCH_RANGE
     points = low + (high - low) * torch.rand(batch, net.permutations.shape[1], generator=torch.Generator().manual_seed(0))
     scene = ((net.scene_low + net.scene_high) / 2).expand(batch, -1).cpu() if net.scene_names else None
-    one, whole = net.member(0).cpu(), copy.deepcopy(net).cpu()
+    nets = {"member": net.member(0).cpu(), "ensemble": copy.deepcopy(net).cpu()}
 
-    def rate(model: HopNet, rows: int) -> float:
+    def duration(ask: Callable[..., Any], rows: int, clock: Callable[[], float]) -> float:
         inputs = points[:rows], None if scene is None else scene[:rows]
-        model(*inputs)
+        ask(*inputs)
         times: list[float] = []
         stop = time.perf_counter() + seconds / 2
         while time.perf_counter() < stop or len(times) < 5:
-            started = time.thread_time()
-            model(*inputs)
-            times.append(time.thread_time() - started)
+            started = clock()
+            ask(*inputs)
+            times.append(clock() - started)
         return float(np.median(times))
 
-    return {
-        "batch": batch,
-        "predictions_per_second_member": batch / rate(one, batch),
-        "predictions_per_second_ensemble": batch / rate(whole, batch),
-        "single_milliseconds": 1e3 * rate(whole, 1),
-    }
+    found: dict[str, Any] = {"batch": batch}
+    frozen = None if {"slope", "slope_direction"} & set(net.scene_names) else {k: FrozenLanding(v) for k, v in nets.items()}
+    with one_thread():
+        for name, one in nets.items():
+            found[f"predictions_per_second_{name}"] = batch / duration(one, batch, time.thread_time)
+            asked = duration(frozen[name], batch, time.thread_time) if frozen else float("nan")
+            found[f"landings_per_second_{name}"] = batch / asked
+        found["single_milliseconds"] = 1e3 * duration(nets["ensemble"], 1, time.thread_time)
+    found["threads"] = torch.get_num_threads()
+    found["landings_per_second_machine"] = (
+        batch / duration(frozen["ensemble"], batch, time.perf_counter) if frozen else float("nan")
+    )
+    return found

@@ -22,6 +22,8 @@ from surrogate.train import TrainConfig, plain, train
 
 #: Shares of the hops, for the error against data size.
 SHARES = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+#: Of the JSON files, so that older ones are not read.
+FORMAT = 2
 #: Widths and depths of the chart of speed against accuracy.
 WIDTHS, DEPTHS = (32, 64, 128, 256), (2, 4)
 
@@ -52,7 +54,7 @@ def run(studies: Iterable[str], data: HopData, folder: Path, steps: int) -> dict
 
 
 def _cell(folder: Path, data: HopData, config: TrainConfig, hops: int) -> dict[str, Any]:
-    key = hash_of({"data": data.digest, "train": plain(config), "hops": hops})
+    key = hash_of({"format": FORMAT, "data": data.digest, "train": plain(config), "hops": hops})
     path = ensure_folder(folder / "studies") / f"{key}.json"
     if path.exists():
         return read_json(path)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from surrogate.dataset import HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.generate import sample_stretches
 from surrogate.kriging import fit_kriging
 from surrogate.model import HopNet, NetConfig, scene_symmetries
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.frozen import FrozenLanding
 from training.inverse import InverseConfig, InversePlanner, fit_energy
 from training.planner import BestOfPlanner, NearestHopPlanner, targets_of
 from training.policies import ActorPolicy, _mlp

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from surrogate.dataset import HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.generate import sample_stretches
 from surrogate.model import HopNet, NetConfig, scene_symmetries
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.scene_ranges import scene_ranges
 from training.evolution import EvolutionConfig
-from training.frozen import FrozenLanding
 from training.inverse import InversePlanner
 from training.similarity import EARTH, alike
 from training.tandem import TandemConfig, TandemPlanner

@@ -15,12 +15,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from surrogate.dataset import HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.kriging import Kriging, fit_process
 from surrogate.model import HopNet, one_thread
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.frozen import FrozenLanding
 from training.planner import NearestHopPlanner, Planner, Prediction
 from training.similarity import alike
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from surrogate import dataset, model
 from surrogate.dataset import Configuration, HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.kriging import fit_kriging
 from surrogate.model import HopNet
 from surrogate.train import train
@@ -23,7 +24,6 @@ from tensegrity_gym.scene_ranges import SceneRanges
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.frozen import FrozenLanding
 from training.inverse import InversePlanner, fit_energy
 from training.planner import NearestHopPlanner, Planner
 from training.tandem import TandemPlanner

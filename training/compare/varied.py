@@ -13,6 +13,7 @@ from torch import Tensor
 
 from surrogate import dataset
 from surrogate.dataset import Configuration, HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.generate import fill, sample_stretches
 from surrogate.model import HopNet, one_thread
 from tensegrity_gym.task import check_fidelity, reach
@@ -21,7 +22,6 @@ from training.compare.config import CompareConfig
 from training.compare.hops import VariedHops
 from training.compare.run import BLOCK, FLOOR_HOPS, Comparison
 from training.evolution import EvolutionConfig
-from training.frozen import FrozenLanding
 from training.inverse import InversePlanner, fit_energy
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner
