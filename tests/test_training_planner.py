@@ -346,3 +346,27 @@ def test_hops_in_turn_respect_the_range_and_survive_failures() -> None:
     # nothing ever flies: the first plan is the answer
     lost = RefiningPlanner(planner, lambda s: np.full((len(s), 2), np.nan), 3)
     np.testing.assert_array_equal(lost.predict(targets)[0], planner.plan(targets).stretches)
+
+
+def test_stored_hops_know_a_slope_that_hops_in_turn_can_follow() -> None:
+    """Exact of a linear map that commutes with the symmetries, also from hops on one side only; without any net."""
+    net = small_net()
+    images = net.permutations.numpy(), net.signs[:, :2].numpy()
+    rng = np.random.default_rng(6)
+    one = rng.normal(0, 0.3, (2, 4))
+    slope = np.mean([sign[:, None] * one[:, np.argsort(p)] for p, sign in zip(*images, strict=True)], axis=0)
+
+    def real(stretches: np.ndarray) -> np.ndarray:
+        return (stretches - 0.5) @ slope.T
+
+    for p, sign in zip(*images, strict=True):
+        np.testing.assert_allclose(slope[:, np.argsort(p)] * sign[:, None], slope, atol=1e-12)
+    known = rng.uniform(0.2, 0.8, (40, 4))
+    planner = NearestHopPlanner(known, real(known), images=images)
+    at = rng.uniform(0.3, 0.7, (6, 4))
+    np.testing.assert_allclose(planner.slope(at), np.broadcast_to(slope, (6, 2, 4)), atol=1e-10)
+    targets = real(at)
+    answers, _ = RefiningPlanner(planner, real, 8).predict(targets)  # steps are short: one is not enough
+    np.testing.assert_allclose(real(answers), targets, atol=1e-6)
+    # fewer hops than a plane has unknowns: the flattest plane through them
+    assert np.isfinite(NearestHopPlanner(known[:2], real(known[:2])).slope(at)).all()

@@ -7,12 +7,16 @@ learns the inverse once and for all, ``evolution`` searches without derivatives.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from tensegrity_gym.errors import InvalidParameterError
 
+#: Stored hops that tell how landings change about a point.
+NEIGHBOURS = 24
 #: Stretches, shape (n, n_actuators), to where their hops land, shape (n, 2) [m]; not-a-number where a hop failed.
 Land = Callable[[np.ndarray], np.ndarray]
 Prediction = tuple[np.ndarray, Any]
@@ -28,6 +32,14 @@ class Planner(Protocol):
         ...
 
 
+class SlopedPlanner(Planner, Protocol):
+    """A planner that also knows how landings change about an answer."""
+
+    def slope(self, stretches: np.ndarray) -> np.ndarray:
+        """How landings change with the stretches (n, n_actuators), shape (n, 2, n_actuators) [m]."""
+        ...
+
+
 def targets_of(observation: np.ndarray) -> np.ndarray:
     """The targets in one observation or a batch of them, shape (n, 2) [m]; InvalidParameterError if they are none."""
     targets = np.atleast_2d(np.asarray(observation, dtype=np.float64))
@@ -39,10 +51,17 @@ def targets_of(observation: np.ndarray) -> np.ndarray:
 class NearestHopPlanner:
     """Repeat the stored hop that landed nearest to the target: the baseline that every other planner must beat.
 
-    ``strangeness``: squared error to expect of each stored hop for its being of another scene, shape (m,) [m^2].
+    ``strangeness``: squared error to expect of each stored hop for its being of another scene, shape (m,) [m^2]. ``images``:
+    symmetries under which hops have images, permutations (g, n_actuators) and signs (g, 2).
     """
 
-    def __init__(self, stretches: np.ndarray, landings: np.ndarray, strangeness: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        stretches: np.ndarray,
+        landings: np.ndarray,
+        strangeness: np.ndarray | None = None,
+        images: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
         if len(stretches) == 0 or len(stretches) != len(landings):
             raise InvalidParameterError(
                 f"expected as many stretches as landings, at least one, got {len(stretches)} and {len(landings)}"
@@ -50,6 +69,10 @@ class NearestHopPlanner:
         self.stretches = np.asarray(stretches, dtype=np.float64)
         self.landings = np.asarray(landings, dtype=np.float64)
         self.strangeness = strangeness
+        n_actuators = self.stretches.shape[1]
+        permutations, signs = (np.arange(n_actuators)[None], np.ones((1, 2))) if images is None else images
+        self._seen = self.stretches[:, permutations].reshape(-1, n_actuators)
+        self._landed = (self.landings[:, None] * signs).reshape(-1, 2)
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -60,6 +83,17 @@ class NearestHopPlanner:
             distance = distance**2 + self.strangeness
         chosen = self.stretches[distance.argmin(axis=1)]
         return (chosen[0] if np.ndim(observation) == 1 else chosen), state
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self._seen)
+
+    def slope(self, stretches: np.ndarray) -> np.ndarray:
+        """Of the plane fitted to the landings of the nearest stored hops and their images; see ``SlopedPlanner``."""
+        near = self._tree.query(stretches, min(NEIGHBOURS, len(self._seen)))[1].reshape(len(stretches), -1)
+        away = self._seen[near] - np.asarray(stretches)[:, None]
+        plane = np.linalg.pinv(np.concatenate([np.ones((*near.shape, 1)), away], axis=2)) @ self._landed[near]
+        return plane[:, 1:].swapaxes(1, 2)
 
 
 class Proposer(Protocol):

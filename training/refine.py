@@ -1,8 +1,8 @@
 """Plan, simulate the plan, correct it by what it missed: a few simulator calls an answer, each chosen by what the last one told.
 
-Between the stored hops the map is rough, and a surrogate errs by millimetres there; close by it runs much as the surrogate's
-slope says. So the answer is corrected by least-norm steps of that slope, which itself is corrected by every hop (Broyden's
-rank-one update; Nocedal and Wright 2006, eq. 11.26).
+Between the stored hops the map is rough, and a surrogate errs by millimetres there; close by it runs much as the slope of the
+surrogate, or of the nearest stored hops, says. So the answer is corrected by least-norm steps of that slope, which itself is
+corrected by every hop (Broyden's rank-one update; Nocedal and Wright 2006, eq. 11.26).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from tensegrity_gym import STRETCH_RANGE
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.types import Floats
-from training.inverse import InversePlanner
-from training.planner import Land, Prediction, targets_of
+from training.planner import Land, Prediction, SlopedPlanner, targets_of
 
 #: Longest step in one stretch: beyond it the slope says nothing.
 LONGEST_STEP = 0.05
@@ -24,12 +23,12 @@ SCATTER_STEP = 1e-3
 
 
 class RefiningPlanner:
-    """Answer with the best of ``tries`` hops, each a step of the secant method from the best so far."""
+    """Answer with the best of ``tries`` hops, the first as ``start`` plans it, each other a secant step from the best so far."""
 
-    def __init__(self, inverse: InversePlanner, land: Land, tries: int = 8) -> None:
+    def __init__(self, start: SlopedPlanner, land: Land, tries: int = 8) -> None:
         if tries < 1:
             raise InvalidParameterError(f"tries: expected an integer >= 1, got {tries}")
-        self.inverse, self.land, self.tries = inverse, land, tries
+        self.start, self.land, self.tries = start, land, tries
         #: Hops simulated for answers so far.
         self.simulator_calls = 0
 
@@ -38,8 +37,8 @@ class RefiningPlanner:
     ) -> Prediction:
         """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4); each costs ``tries`` simulator calls."""
         targets = targets_of(observation)
-        asked = self.inverse.plan(targets).stretches
-        slope = self.inverse.slope(asked)
+        asked, _ = self.start.predict(targets)
+        slope = self.start.slope(asked)
         best, there, least = asked, np.full(targets.shape, np.nan), np.full(len(targets), np.inf)
         for k in range(self.tries):
             landings = np.asarray(self.land(asked), dtype=np.float64)

@@ -28,6 +28,7 @@ class Stages:
         self.say = say
         self.hashes: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
+        self.dates: dict[str, str] = {}
         self.results: dict[str, Results] = {}
         self.skipped: list[str] = []
 
@@ -54,7 +55,7 @@ class Stages:
             write_json(path, record)
             self.say(f"{name}: {seconds:.1f} s")
         self.hashes[name] = wanted
-        self.seconds[name] = float(record["seconds"])
+        self.seconds[name], self.dates[name] = float(record["seconds"]), record["date"]
         self.results[name] = record["results"]
         return self.results[name]
 

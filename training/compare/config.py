@@ -50,8 +50,8 @@ class CompareConfig:
     """Proposals that best-of-T simulates before it answers."""
     tries_seeds: int | None = None
     """Seeds for which best-of-T is run, which costs most hops; None: all."""
-    refine: int = 8
-    """Hops per answer of the planner that plans each from the last; 0: leave it out."""
+    refine: tuple[int, ...] = (4, 8)
+    """Hops per answer of planners that plan each from the last, from the ensemble's answer and from the nearest stored hop."""
     search: int = 400
     """Looks per target of CMA-ES on the surrogate."""
     oracle: int = 160
@@ -108,7 +108,7 @@ class CompareConfig:
             targets=2,
             perturbations=2,
             tries=(2,),
-            refine=2,
+            refine=(2,),
             search=16,
             oracle=4,
             updates=50,

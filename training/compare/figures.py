@@ -32,12 +32,13 @@ def _look(k: int) -> dict[str, object]:
 def _levels(axes: Axes, outcome: Outcome, along: str = "y") -> None:
     draw = axes.axhline if along == "y" else axes.axvline
     draw(outcome.factor * outcome.floor, color="#888888", ls=":", label="floor: start moved by 10 µm")
+    draw(outcome.factor * outcome.scatter, color="#888888", ls=(0, (1, 4)), label="scatter of the best answers")
     if outcome.oracle is not None:
         draw(outcome.factor * outcome.oracle, color="#888888", ls="--", label="CMA-ES on the simulator")
 
 
 def sample_efficiency(outcome: Outcome, path: Path) -> Path:
-    """Interquartile mean error against simulator calls, with its 95 % interval."""
+    """Interquartile mean error against simulator calls, with its interval."""
     with _style():
         figure, axes = plt.subplots(figsize=(9, 4.6), layout="constrained")
         for k, method in enumerate(outcome.methods):

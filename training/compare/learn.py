@@ -90,7 +90,7 @@ class Fitted:
         if name not in self._made:
             started = time.perf_counter()
             make: dict[str, Callable[[], Planner]] = {
-                "nearest": lambda: NearestHopPlanner(self.data["stretches"], self.data["landing"]),
+                "nearest": lambda: NearestHopPlanner(self.data["stretches"], self.data["landing"], images=self.images),
                 "single": lambda: InversePlanner(
                     lambda s: self.landing(s)[:1], self.config.inverse, stored=self.data["stretches"]
                 ),
@@ -115,6 +115,11 @@ class Fitted:
             seed=self.seed,
         )
 
+    @property
+    def images(self) -> tuple[np.ndarray, np.ndarray]:
+        """Symmetries that hops have images under: permutations (g, n_actuators) and signs (g, 2)."""
+        return self.net.permutations.numpy(), self.net.signs[:, :2].numpy()
+
     def _tandem(self) -> TandemPlanner:
         def see(stretches: Tensor) -> tuple[Tensor, Tensor]:
             landings = self.landing(stretches)
@@ -125,8 +130,8 @@ class Fitted:
             see,
             self.data["landing"],
             replace(self.config.tandem, seed=self.seed),
-            permutations=self.net.permutations.numpy(),
-            signs=self.net.signs[:, :2].numpy(),
+            permutations=self.images[0],
+            signs=self.images[1],
         )
 
     def _evolution(self) -> EvolutionPlanner:

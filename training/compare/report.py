@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,8 +14,8 @@ from surrogate.storage import atomic_path, ensure_folder, package_versions
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_PLACES
 from training.compare import figures
-from training.compare.results import Outcome, Summary, label
-from training.compare.statistics import interquartile_mean
+from training.compare.results import Outcome, Summary, answer_calls, label
+from training.compare.statistics import FEWEST_SEEDS, interquartile_mean
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -26,8 +25,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(found: Summary, factor: float) -> str:
-    middle = f"{factor * found.mean:.3g}"
-    return middle if found.seeds == 1 else f"{middle} [{factor * found.low:.3g}, {factor * found.high:.3g}]"
+    middle, low, high = (f"{factor * value:.3g}" for value in (found.mean, found.low, found.high))
+    if low == high:
+        return middle
+    return f"{middle} ({low} to {high})" if found.seeds < FEWEST_SEEDS else f"{middle} [{low}, {high}]"
 
 
 def _plain(value: float) -> str:
@@ -37,12 +38,49 @@ def _plain(value: float) -> str:
 
 def by_budget(outcome: Outcome) -> str:
     """Interquartile mean errors on targets inside, by method and budget."""
-    budgets = sorted({b for m in outcome.methods for b in outcome.budgets(m)})
+    budgets = _budgets(outcome)
     rows = [
-        [label(m), *(_cell(outcome.summary(m, b), outcome.factor) if b in outcome.budgets(m) else "" for b in budgets)]
+        [
+            label(m),
+            str(answer_calls(m)),
+            *(_cell(outcome.summary(m, b), outcome.factor) if b in outcome.budgets(m) else "" for b in budgets),
+        ]
         for m in outcome.methods
     ]
-    return table([f"error [{outcome.shown}] after so many simulator calls", *(f"{b:,}".replace(",", " ") for b in budgets)], rows)
+    return table([f"error [{outcome.shown}]", "hops per answer", *(f"after {_spaced(b)}" for b in budgets)], rows)
+
+
+def _budgets(outcome: Outcome) -> list[int]:
+    return sorted({b for m in outcome.methods for b in outcome.budgets(m)})
+
+
+def _spaced(number: int) -> str:
+    return f"{number:,}".replace(",", " ")
+
+
+def caption(outcome: Outcome) -> str:
+    """What the table of :func:`by_budget` shows, of how many seeds, and when it was run."""
+    config, (first, last) = outcome.comparison.config, outcome.dates
+    budgets = _budgets(outcome)
+    alike: dict[tuple[int, ...], list[str]] = {}
+    for m in outcome.methods:
+        counts = tuple(len(outcome.scores.get((m, b), ())) for b in budgets)
+        name = label(m).replace("the same, ", f"{label(outcome.methods[0]) if m.startswith('repeat') else 'ensemble'}, ")
+        alike.setdefault(counts, []).append(name)
+    seeds = "; ".join(f"{', '.join(names)}: {', '.join(map(str, counts))}" for counts, names in alike.items())
+    oracle = ""
+    if outcome.oracle is not None:
+        calls = outcome.records["oracle"]["calls_per_answer"]
+        oracle = f" CMA-ES on the simulator, {calls:.0f} hops an answer, comes to {_shown(outcome, outcome.oracle)}."
+    return (
+        f"Interquartile mean landing error over {len(outcome.comparison.places['inside'])} targets inside the reachable region "
+        f"and training seeds, after so many simulator calls learnt from; {config.perturbations} starts an answer, moved by "
+        f"10 µm. Brackets: 95 % interval over seeds; parentheses, where seeds are fewer than {FEWEST_SEEDS}: their range. The "
+        f"floor, how far moving its start carries a random hop's landing, is {_shown(outcome, outcome.floor)}; the best answers' "
+        f"landings lie {_shown(outcome, outcome.scatter)} from their own mean.{oracle} "
+        f"Seeds at {', '.join(_spaced(b) for b in budgets)} calls: {seeds}. "
+        f"Run {'on ' + first if first == last else f'from {first} to {last}'}."
+    )
 
 
 def by_place(outcome: Outcome) -> str:
@@ -52,7 +90,7 @@ def by_place(outcome: Outcome) -> str:
         budget = outcome.budgets(m)[-1]
         name = "CMA-ES on the simulator" if m == "oracle" else label(m)
         cells = [f"{outcome.factor * outcome.summary(m, budget, place).mean:.3g}" for place in TARGET_PLACES]
-        rows.append([name, f"{budget:,}".replace(",", " "), *cells])
+        rows.append([name, _spaced(budget), *cells])
     return table([f"error [{outcome.shown}] of targets", "calls", *TARGET_PLACES], rows)
 
 
@@ -66,14 +104,14 @@ def in_detail(outcome: Outcome) -> str:
         rows.append(
             [
                 label(m),
-                f"{budget:,}".replace(",", " "),
+                _spaced(budget),
                 str(found.seeds),
                 f"{outcome.factor * found.p95:.3g}",
                 f"{100 * found.missed:.1f}",
                 f"{outcome.improvement('ensemble', m, budget):.2f}" if comparable else "",
                 *(["", ""] if times is None else [_plain(1e3 * t) for t in times]),
                 _plain(outcome.learning_seconds(m, budget)),
-                m.removeprefix("best").removeprefix("refine") if m.startswith(("best", "refine")) else "0",
+                str(answer_calls(m)),
             ]
         )
     head = [
@@ -86,7 +124,7 @@ def in_detail(outcome: Outcome) -> str:
         "p50 [ms]",
         "p99 [ms]",
         "learning [s]",
-        "calls per answer",
+        "hops per answer",
     ]
     return table(head, rows)
 
@@ -104,7 +142,7 @@ def by_gravity(outcome: Outcome) -> str:
         errors = outcome.errors(m, budget) * outcome.unit[rows]
         parts = [errors[:, third == k] for k in range(3)]
         shown = [f"{1e3 * interquartile_mean(part):.3g}" if part.size else "" for part in parts]
-        cells.append([label(m), f"{budget:,}".replace(",", " "), *shown])
+        cells.append([label(m), _spaced(budget), *shown])
     return table(["error [mm] where gravity is", "calls", *head], cells)
 
 
@@ -113,19 +151,14 @@ def section(outcome: Outcome, pictures: str) -> str:
     comparison = outcome.comparison
     config, name = comparison.config, tag(outcome)
     rows = {p: len(points) for p, points in comparison.places.items()}
-    oracle = ""
-    if outcome.oracle is not None:
-        calls = outcome.records["oracle"]["calls_per_answer"]
-        oracle = f" CMA-ES on the simulator, {calls:.0f} hops a target, reaches {_shown(outcome, outcome.oracle)}."
     budget = outcome.common_budget
     return f"""## {config.scene.capitalize()}, landing read at {config.landing}
 
-Run on {datetime.now(UTC).date()}: model version {MODEL_VERSION}, fidelity {config.fidelity}, {_scene(outcome)},
+Model version {MODEL_VERSION}, fidelity {config.fidelity}, {_scene(outcome)},
 targets {", ".join(f"{n} {p}" for p, n in rows.items())}, {config.perturbations} moved starts an answer,
 {package_versions_text()}.
 
-Interquartile mean over targets inside and seeds, with its 95 % interval over seeds. The floor, how far a random hop's landing
-moves with its start, is {_shown(outcome, outcome.floor)}.{oracle}
+{caption(outcome)}
 
 {by_budget(outcome)}
 
@@ -179,7 +212,7 @@ def write_all(outcome: Outcome, page: Path, images: Path, readme: Path | None = 
     relative = Path(os.path.relpath(images, page.parent)).as_posix()
     replace_between(page, name, section(outcome, relative), append=True)
     written.append(page)
-    if readme is not None and readme.exists() and replace_between(readme, name, by_budget(outcome)):
+    if readme is not None and readme.exists() and replace_between(readme, name, f"{caption(outcome)}\n\n{by_budget(outcome)}"):
         written.append(readme)
     return written
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_LIMIT, TARGET_PLACES
 from tensegrity_gym.types import Floats
-from training.compare.run import Comparison
+from training.compare.run import REFINED, Comparison
 from training.compare.statistics import interquartile_mean, interval, probability_of_improvement
 
 LABELS = {
@@ -28,9 +29,14 @@ def label(method: str) -> str:
     """A method's name in tables and figures."""
     if method.startswith("best"):
         return f"the same, best of {method[4:]} simulated"
-    if method.startswith("refine"):
-        return f"the same, {method[6:]} simulated in turn"
+    if method.startswith(tuple(REFINED.values())):
+        return f"the same, {answer_calls(method)} simulated in turn"
     return LABELS.get(method, method)
+
+
+def answer_calls(method: str) -> int:
+    """Hops that a method simulates for each answer."""
+    return int(re.sub("^[a-z]+", "", method) or 0) if method.startswith(("best", *REFINED.values())) else 0
 
 
 def _place(method: str) -> tuple[int, int]:
@@ -38,8 +44,9 @@ def _place(method: str) -> tuple[int, int]:
     known = list(LABELS)
     if method.startswith("best"):
         return known.index("ensemble"), int(method[4:])
-    if method.startswith("refine"):
-        return known.index("ensemble"), 1000 + int(method[6:])
+    for start, name in REFINED.items():
+        if method.startswith(name):
+            return known.index(start), 1000 + answer_calls(method)
     return (known.index(method) if method in known else len(known)), 0
 
 
@@ -48,7 +55,7 @@ class Summary:
     """Errors of one method at one budget, on the targets of one place, in metres or, where scenes vary, in reaches."""
 
     mean: float  #: interquartile mean
-    low: float  #: its 95 % interval
+    low: float  #: its 95 % interval, see ``statistics.interval``
     high: float  #: likewise
     p95: float  #: of single landings
     missed: float  #: share of single landings farther than ``SUCCESS_RADIUS`` reaches from the target [-]
@@ -107,13 +114,13 @@ class Outcome:
         A failed hop counts as one that landed as far away as any target may be.
         """
         rows = self.rows[place]
-        targets, unit = self.comparison.targets[rows, :2], self.unit[rows, None]
-        parts = []
-        for seed in self.scores[method, budget]:
-            landings = np.array(self.records[f"score_{method}_{seed}_{budget}"]["landings"], dtype=np.float64)[rows, 1:]
-            error = np.linalg.norm(landings - targets[:, None], axis=2)
-            parts.append(np.where(np.isfinite(error), error, TARGET_LIMIT * self.reaches[rows, None]) / unit)
-        return np.stack(parts)
+        error = np.linalg.norm(self._landings(method, budget, place) - self.comparison.targets[rows, None, :2], axis=3)
+        return np.where(np.isfinite(error), error, TARGET_LIMIT * self.reaches[rows, None]) / self.unit[rows, None]
+
+    def _landings(self, method: str, budget: int, place: str) -> Floats:
+        """From moved starts, shape (seeds, targets, perturbations, 2) [m]."""
+        records = [self.records[f"score_{method}_{seed}_{budget}"] for seed in self.scores[method, budget]]
+        return np.stack([np.array(r["landings"], dtype=np.float64)[self.rows[place], 1:] for r in records])
 
     def errors(self, method: str, budget: int, place: str = "inside") -> Floats:
         """Mean over the moved starts, shape (seeds, targets)."""
@@ -138,6 +145,28 @@ class Outcome:
         return float(interquartile_mean(np.array(record["distances"]).mean(axis=1) / np.array(record.get("reaches", 1.0))))
 
     @property
+    def scatter(self) -> float:
+        """How far landings of the best answers lie from their own mean when the start is moved: no aim does better.
+
+        Interquartile mean over targets inside and seeds, of the method that errs least of those that were run.
+        """
+        method, budget = min(self.scores, key=lambda key: float(interquartile_mean(self.errors(*key))))
+        landings = self._landings(method, budget, "inside")
+        count = landings.shape[2]
+        if count < 2:
+            return float("nan")
+        apart = np.linalg.norm(landings - np.nanmean(landings, axis=2, keepdims=True), axis=3)
+        # about a mean of few, distances are too small by this root
+        apart *= np.sqrt(count / (count - 1)) / self.unit[self.rows["inside"], None]
+        return float(interquartile_mean(np.nanmean(apart, axis=2)))
+
+    @property
+    def dates(self) -> tuple[str, str]:
+        """Days of the first and of the last score."""
+        days = sorted(date[:10] for name, date in self.comparison.stages.dates.items() if name.startswith("score_"))
+        return days[0], days[-1]
+
+    @property
     def oracle(self) -> float | None:
         """Interquartile mean error of CMA-ES on the simulator, None where it was not run."""
         found = [b for m, b in self.scores if m == "oracle"]
@@ -157,8 +186,9 @@ class Outcome:
                 times.append(record["seconds"] - record["simulating"])
             else:
                 plans = self.records[f"plans_{tag}"]
-                own = plans["ensemble" if method.startswith(("best", "refine")) else method]["seconds"]
-                times.append(own + (0.0 if method == "nearest" else self.seconds[f"net_{tag}"]))
+                start = next((s for s, name in REFINED.items() if method.startswith(name)), method)
+                own = plans["ensemble" if method.startswith("best") else start]["seconds"]
+                times.append(own + (0.0 if start == "nearest" else self.seconds[f"net_{tag}"]))
         return float(np.mean(times))
 
     def latency(self, method: str) -> tuple[float, float] | None:

@@ -31,6 +31,8 @@ from training.stages import Results, Stages
 BLOCK = 2048
 #: Random hops that the floor is measured on.
 FLOOR_HOPS = 64
+#: Planners whose answers hops in turn may begin from, and what the methods that do so are called, before how many they are.
+REFINED = {"nearest": "repeat", "ensemble": "refine"}
 #: Targets of questions whose latency is measured.
 LATENCY_SEED = 5
 
@@ -40,6 +42,8 @@ class Comparison:
 
     #: Settings of policies that differ from the usual ones.
     policy_settings: ClassVar[dict[str, Any]] = {}
+    #: Planners that hops in turn begin from.
+    starts: ClassVar[tuple[str, ...]] = tuple(REFINED)
     hops: Any
 
     def __init__(self, config: CompareConfig) -> None:
@@ -72,8 +76,9 @@ class Comparison:
             self._planners(seed, budget)
             if config.tries_seeds is None or seed < config.tries_seeds:
                 self._best_of(seed, budget)
-            if config.refine:
-                self._refined(seed, budget)
+            for tries in config.refine:
+                for start in self.starts:
+                    self._refined(start, tries, seed, budget)
         self._oracle()
         for seed, budget in config.policy_runs:
             for algorithm in config.algorithms:
@@ -187,21 +192,22 @@ class Comparison:
         for tries in self.config.tries:
             self._score(f"best{tries}", seed, budget, f"best_{tag}", partial(self._kept, f"best_{tag}", str(tries)))
 
-    def _refined(self, seed: int, budget: int) -> None:
-        tag, tries = f"{seed}_{budget}", self.config.refine
+    def _refined(self, start: str, tries: int, seed: int, budget: int) -> None:
+        method, tag = f"{REFINED[start]}{tries}", f"{seed}_{budget}"
+        name = f"{method}_{tag}"
 
         def work() -> Results:
-            planner = self._refining(self.fitted(seed, budget), tries)
+            planner = self._refining(self.fitted(seed, budget), start, tries)
             return {"stretches": planner.predict(self.targets)[0].tolist()}
 
-        self.stages.run(f"refine_{tag}", {"tries": tries, "method": "secant"}, work, needs=[f"plans_{tag}"])
-        self._score(f"refine{tries}", seed, budget, f"refine_{tag}", lambda: self.stages.results[f"refine_{tag}"])
+        self.stages.run(name, {"tries": tries, "method": "secant"}, work, needs=[f"plans_{tag}"])
+        self._score(method, seed, budget, name, lambda: self.stages.results[name])
 
     def _best(self, fitted: Any, tries: int) -> Planner:
         return BestOfPlanner(fitted.inverse, self.hops.land, tries)
 
-    def _refining(self, fitted: Any, tries: int) -> Planner:
-        return RefiningPlanner(fitted.inverse, self.hops.land, tries)
+    def _refining(self, fitted: Any, start: str, tries: int) -> Planner:
+        return RefiningPlanner(fitted[start], self.hops.land, tries)
 
     def _oracle(self) -> None:
         if not self.config.oracle or not find_spec("cma"):
@@ -271,8 +277,7 @@ class Comparison:
             fitted = self.fitted(0, budget)
             asked: dict[str, Planner] = {name: fitted[name] for name in self.names}
             asked |= {f"best{t}": self._best(fitted, t) for t in self.config.tries}
-            if self.config.refine:
-                asked[f"refine{self.config.refine}"] = self._refining(fitted, self.config.refine)
+            asked |= {f"{REFINED[s]}{t}": self._refining(fitted, s, t) for t in self.config.refine for s in self.starts}
             asked |= {a: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for a, name in policies.items()}
             return {name: self._questions(planner, name) for name, planner in asked.items()}
 
@@ -282,7 +287,7 @@ class Comparison:
 
     def _questions(self, planner: Planner, name: str) -> list[float]:
         """Wall times of single questions [s], after two to warm up."""
-        slow = name.startswith(("best", "refine"))
+        slow = name.startswith(("best", *REFINED.values()))
         count = max(2, self.config.latencies // 10) if slow else self.config.latencies
         rng = np.random.default_rng(LATENCY_SEED)
         inside = self.places["inside"]

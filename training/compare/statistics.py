@@ -8,6 +8,9 @@ from scipy import stats
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.types import Floats
 
+#: Seeds from which on a bootstrap over them says something.
+FEWEST_SEEDS = 5
+
 
 def interquartile_mean(values: Floats, axis: int | None = None) -> Floats:
     """Mean of the middle half: as robust as a median, with less scatter."""
@@ -17,17 +20,23 @@ def interquartile_mean(values: Floats, axis: int | None = None) -> Floats:
 def interval(errors: Floats, level: float = 0.95, draws: int = 2000, seed: int = 0) -> tuple[float, float]:
     """Bootstrap interval of the interquartile mean of ``errors``, shape (seeds, targets), at ``level``.
 
-    Stratified: seeds are drawn anew within each target, so it speaks of other training seeds on the same targets. With one
-    seed there is nothing to draw from, and both ends are not a number.
+    Whole seeds are drawn: one training answers all targets, and a bad one errs on many, so that seeds drawn anew within each
+    target, as for benchmarks whose every task has trainings of its own, would promise too much. The targets are the same in
+    each draw. With fewer than ``FEWEST_SEEDS`` the ends are those of the range of the seeds' own interquartile means.
     """
-    seeds, targets = _checked(errors).shape
-    if seeds == 1:
-        return float("nan"), float("nan")
-    rng = np.random.default_rng(seed)
-    drawn = errors[rng.integers(seeds, size=(draws, seeds, targets)), np.arange(targets)]
-    means = interquartile_mean(drawn.reshape(draws, -1), axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
+    seeds = len(_checked(errors))
+    if seeds < FEWEST_SEEDS:
+        own = interquartile_mean(errors, axis=1)
+        return float(own.min()), float(own.max())
+
+    def statistic(rows: np.ndarray, axis: int = -1) -> Floats:
+        drawn = errors[rows]  # (..., seeds, targets)
+        return interquartile_mean(drawn.reshape(*drawn.shape[:-2], -1), axis=-1)
+
+    found = stats.bootstrap(
+        (np.arange(seeds),), statistic, n_resamples=draws, confidence_level=level, method="percentile", random_state=seed
+    ).confidence_interval
+    return float(found.low), float(found.high)
 
 
 def probability_of_improvement(ours: Floats, theirs: Floats) -> float:

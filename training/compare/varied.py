@@ -39,6 +39,7 @@ class VariedComparison(Comparison):
 
     #: All envs of a step share a scene, as every 16 hops of a data set do; more envs would see fewer scenes.
     policy_settings: ClassVar[dict[str, Any]] = {"envs": 16}
+    starts: ClassVar[tuple[str, ...]] = ("ensemble",)
 
     def __init__(self, config: CompareConfig) -> None:
         super().__init__(config)
@@ -107,7 +108,8 @@ class VariedComparison(Comparison):
     def _best(self, fitted: VariedFitted, tries: int) -> Planner:
         return VariedPlanner(lambda values: BestOfPlanner(fitted.planner(values), self._land_at(values), tries), self.scenes)
 
-    def _refining(self, fitted: VariedFitted, tries: int) -> Planner:
+    def _refining(self, fitted: VariedFitted, start: str, tries: int) -> Planner:
+        assert start == "ensemble"
         return VariedPlanner(lambda values: RefiningPlanner(fitted.planner(values), self._land_at(values), tries), self.scenes)
 
     def _search_of(self, data: HopData) -> Planner:
