@@ -8,6 +8,7 @@ from pathlib import Path
 from surrogate.model import NetConfig
 from surrogate.train import TrainConfig
 from tensegrity_gym.errors import InvalidParameterError
+from training.compare.targets import SCENES, VARIED
 from training.inverse import InverseConfig
 from training.tandem import TandemConfig
 
@@ -52,6 +53,11 @@ class CompareConfig:
     """Seeds for which best-of-T is run, which costs most hops; None: all."""
     refine: tuple[int, ...] = (4, 8)
     """Hops per answer of planners that plan each from the last, from the ensemble's answer and from the nearest stored hop."""
+    bayes: int = 0
+    """Hops per answer of the planner that chooses each by Bayesian optimisation, which needs the extra `botorch`; 0: leave it
+    out. Not where scenes vary."""
+    bayes_seeds: int | None = None
+    """Seeds for which Bayesian optimisation is run; None: all."""
     search: int = 400
     """Looks per target of CMA-ES on the surrogate."""
     oracle: int = 160
@@ -88,6 +94,12 @@ class CompareConfig:
         for name, (numbers, budgets) in each.items():
             if len(numbers) not in (1, len(budgets)):
                 raise InvalidParameterError(f"{name}: expected one number, or one for each of {budgets}, got {numbers}")
+        if self.bayes < 0:
+            raise InvalidParameterError(f"bayes: expected an integer >= 0, got {self.bayes}")
+        if self.bayes and self.scene in VARIED:
+            raise InvalidParameterError(
+                f"bayes: expected 0 where scenes vary, got {self.bayes}; leave it out, or choose one of the scenes {SCENES}"
+            )
         strangers = sorted(set(self.algorithms) - set(ALGORITHMS))
         if strangers:
             raise InvalidParameterError(f"algorithms: expected some of {ALGORITHMS}, got {strangers}")
@@ -109,6 +121,7 @@ class CompareConfig:
             perturbations=2,
             tries=(2,),
             refine=(2,),
+            bayes=min(self.bayes, 2),
             search=16,
             oracle=4,
             updates=50,

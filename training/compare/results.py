@@ -10,7 +10,7 @@ import numpy as np
 
 from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_LIMIT, TARGET_PLACES
 from tensegrity_gym.types import Floats
-from training.compare.run import REFINED, Comparison
+from training.compare.run import SIMULATING, Comparison
 from training.compare.statistics import interquartile_mean, interval, probability_of_improvement
 
 LABELS = {
@@ -29,14 +29,16 @@ def label(method: str) -> str:
     """A method's name in tables and figures."""
     if method.startswith("best"):
         return f"the same, best of {method[4:]} simulated"
-    if method.startswith(tuple(REFINED.values())):
+    if method.startswith(("repeat", "refine")):
         return f"the same, {answer_calls(method)} simulated in turn"
+    if method.startswith("bayes"):
+        return f"the same, {answer_calls(method)} simulated in turn by BoTorch"
     return LABELS.get(method, method)
 
 
 def answer_calls(method: str) -> int:
     """Hops that a method simulates for each answer."""
-    return int(re.sub("^[a-z]+", "", method) or 0) if method.startswith(("best", *REFINED.values())) else 0
+    return int(re.sub("^[a-z]+", "", method) or 0) if method.startswith(tuple(SIMULATING)) else 0
 
 
 def _place(method: str) -> tuple[int, int]:
@@ -44,9 +46,9 @@ def _place(method: str) -> tuple[int, int]:
     known = list(LABELS)
     if method.startswith("best"):
         return known.index("ensemble"), int(method[4:])
-    for start, name in REFINED.items():
-        if method.startswith(name):
-            return known.index(start), 1000 + answer_calls(method)
+    for k, prefix in enumerate(("repeat", "refine", "bayes")):
+        if method.startswith(prefix):
+            return known.index(SIMULATING[prefix]), 1000 * (k + 1) + answer_calls(method)
     return (known.index(method) if method in known else len(known)), 0
 
 
@@ -186,12 +188,12 @@ class Outcome:
                 times.append(record["seconds"] - record["simulating"])
             else:
                 plans = self.records[f"plans_{tag}"]
-                start = next((s for s, name in REFINED.items() if method.startswith(name)), method)
-                own = plans["ensemble" if method.startswith("best") else start]["seconds"]
+                start = next((s for prefix, s in SIMULATING.items() if method.startswith(prefix)), method)
+                own = plans[start]["seconds"]
                 times.append(own + (0.0 if start == "nearest" else self.seconds[f"net_{tag}"]))
         return float(np.mean(times))
 
     def latency(self, method: str) -> tuple[float, float] | None:
         """Median and 99th percentile of a single question's wall time [s]."""
-        times = self.records.get("latency", {}).get(method)
+        times = self.records.get("latency", {}).get(method) or self.records.get(f"latency_{method}", {}).get(method)
         return None if times is None else (float(np.median(times)), float(np.quantile(times, 0.99)))

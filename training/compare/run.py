@@ -17,6 +17,7 @@ from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
 from surrogate.model import HopNet
 from tensegrity_gym.task import check_fidelity, reach
+from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
@@ -33,6 +34,8 @@ BLOCK = 2048
 FLOOR_HOPS = 64
 #: Planners whose answers hops in turn may begin from, and what the methods that do so are called, before how many they are.
 REFINED = {"nearest": "repeat", "ensemble": "refine"}
+#: How the names of methods begin that simulate some hops for each answer, whose number follows, and what they begin from.
+SIMULATING = {"best": "ensemble", "repeat": "nearest", "refine": "ensemble", "bayes": "ensemble"}
 #: Targets of questions whose latency is measured.
 LATENCY_SEED = 5
 
@@ -48,6 +51,8 @@ class Comparison:
 
     def __init__(self, config: CompareConfig) -> None:
         self.config = config
+        if config.bayes:
+            require_botorch()
         changes = {} if config.duration is None else {"duration": config.duration}
         self.scenes = registered.scenes_of(config.scene, config.landing, **changes)
         self.scene = self.scenes.base
@@ -79,6 +84,8 @@ class Comparison:
             for tries in config.refine:
                 for start in self.starts:
                     self._refined(start, tries, seed, budget)
+            if config.bayes and (config.bayes_seeds is None or seed < config.bayes_seeds):
+                self._bayesian(seed, budget)
         self._oracle()
         for seed, budget in config.policy_runs:
             for algorithm in config.algorithms:
@@ -203,11 +210,25 @@ class Comparison:
         self.stages.run(name, {"tries": tries, "method": "secant"}, work, needs=[f"plans_{tag}"])
         self._score(method, seed, budget, name, lambda: self.stages.results[name])
 
+    def _bayesian(self, seed: int, budget: int) -> None:
+        name, tries = f"bayes_{seed}_{budget}", self.config.bayes
+
+        def work() -> Results:
+            planner = self._optimising(self.fitted(seed, budget), tries)
+            return {"stretches": planner.predict(self.targets)[0].tolist()}
+
+        settings = {"tries": tries, "process": asdict(BayesianConfig())}
+        self.stages.run(name, settings, work, needs=[f"plans_{seed}_{budget}"])
+        self._score(f"bayes{tries}", seed, budget, name, lambda: self.stages.results[name])
+
     def _best(self, fitted: Any, tries: int) -> Planner:
         return BestOfPlanner(fitted.inverse, self.hops.land, tries)
 
     def _refining(self, fitted: Any, start: str, tries: int) -> Planner:
         return RefiningPlanner(fitted[start], self.hops.land, tries)
+
+    def _optimising(self, fitted: Any, tries: int) -> Planner:
+        return BayesianPlanner(fitted.inverse, self.hops.land, fitted.data["stretches"], fitted.data["landing"], tries)
 
     def _oracle(self) -> None:
         if not self.config.oracle or not find_spec("cma"):
@@ -284,10 +305,19 @@ class Comparison:
         needs = [f"net_0_{budget}", *policies.values()]
         content = {"questions": self.config.latencies, "tries": self.config.tries, "refine": self.config.refine}
         self.stages.run("latency", content, work, needs=needs)
+        if self.config.bayes and self.config.bayes_seeds != 0:  # apart, so that the others' times stay as they were
+            name, tries = f"bayes{self.config.bayes}", self.config.bayes
+            content = {"questions": self.config.latencies, "tries": tries, "process": asdict(BayesianConfig())}
+            self.stages.run(
+                f"latency_{name}",
+                content,
+                lambda: {name: self._questions(self._optimising(self.fitted(0, budget), tries), name)},
+                needs=needs[:1],
+            )
 
     def _questions(self, planner: Planner, name: str) -> list[float]:
         """Wall times of single questions [s], after two to warm up."""
-        slow = name.startswith(("best", *REFINED.values()))
+        slow = name.startswith(tuple(SIMULATING))
         count = max(2, self.config.latencies // 10) if slow else self.config.latencies
         rng = np.random.default_rng(LATENCY_SEED)
         inside = self.places["inside"]
