@@ -32,8 +32,8 @@ class BayesianConfig:
     neighbours: int = 150
     """Stored hops that the process is of."""
     length: float = 0.1
-    """Length scale of the process, in stretches. Not fitted: a thousand stored hops lie too far apart to tell it, and the likeliest
-    lengths about a plan come out anywhere from 0.01 to 40; from ten thousand, near 0.06, which lands no nearer."""
+    """Length scale of the process, in stretches. Not fitted: a thousand stored hops lie too far apart to tell it, and the
+    likeliest lengths about a plan come out anywhere from 0.01 to 40; from ten thousand, near 0.06, which lands no nearer."""
     noise: float = 2e-4
     """Standard deviation of a landing about the process, in each direction [m]."""
     radius: float = 0.1
