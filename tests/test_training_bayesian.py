@@ -180,7 +180,7 @@ def test_a_comparison_that_asks_for_it_adds_it_and_keeps_all_else(tmp_path: Path
     assert set(asked.stages.results) - set(asked.stages.skipped) == added
     assert set(asked.stages.skipped) == set(before.stages.results)
     outcome = Outcome(asked)
-    assert outcome.methods == ["nearest", "single", "ensemble", "refine2", "bayes2", "tandem", "cma"]
+    assert outcome.methods == ["nearest", "repeat2", "single", "ensemble", "refine2", "bayes2", "tandem", "cma"]
     assert label("bayes2") == "the same, 2 simulated in turn by BoTorch"
     assert outcome.scores["bayes2", 16] == [0]
     assert outcome.latency("bayes2") is not None
