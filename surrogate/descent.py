@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from surrogate.model import HopNet
-from surrogate.storage import atomic_path, ensure_folder
+from surrogate.storage import ensure_folder, read_sealed, write_sealed
 from tensegrity_gym.errors import DataFileError
 
 if TYPE_CHECKING:
@@ -89,7 +91,7 @@ class Descent:
             self.save(path, fingerprint)
 
     def save(self, path: Path, fingerprint: str) -> None:
-        """Write all that the next epoch depends on, in one file, by a rename."""
+        """Write all that the next epoch depends on, in one sealed file, by a rename."""
         ensure_folder(path.parent)
         tensors = {f"net/{name}": value for name, value in self.net.state_dict().items()}
         tensors |= {f"best/{name}": value for name, value in self.best_state.items()}
@@ -104,8 +106,7 @@ class Descent:
         }
         metadata = {"fingerprint": fingerprint, **{name: str(value) for name, value in numbers.items()}}
         content = save_tensors({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, metadata)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(content)
+        write_sealed(path, content)
 
     def resume(self, path: Path | None, fingerprint: str) -> float:
         """Go on from a saved training of the same data and settings; returns the seconds it had taken, 0 without one.
@@ -114,17 +115,16 @@ class Descent:
         """
         if path is None or not path.exists():
             return 0.0
+        content = read_sealed(path)
         try:
-            with safe_open(str(path), framework="pt") as file:
-                kept = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            kept = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
             if kept["fingerprint"] != fingerprint:
                 return 0.0
-            self._take(tensors)
+            self._take(load_tensors(content))
             self.epoch, self.best_epoch = int(kept["epoch"]), int(kept["best_epoch"])
             self.best, self.before = float.fromhex(kept["best"]), float(kept["seconds"])
-        except (OSError, KeyError, ValueError, RuntimeError, SafetensorError) as error:
-            raise DataFileError(f"{path}: expected a saved training ({error}); delete it to start anew") from error
+        except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
+            raise DataFileError(f"{path}: expected a saved training ({error!r}); delete it to start anew") from error
         return self.before
 
     def _take(self, tensors: dict[str, Tensor]) -> None:

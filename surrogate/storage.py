@@ -18,6 +18,8 @@ from tensegrity_gym.errors import DataFileError, FileInUseError, OutputFolderErr
 
 #: Reasons for which the system refuses to write: no space, no quota, file too large, read-only.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+#: How a sealed file begins; then come the SHA-256 of its content in hex, a line feed and the content.
+SEAL = b"tensegrity_gym sealed/1 sha256 "
 PACKAGES = ("numpy", "numba", "scipy", "h5py", "gymnasium", "torch", "stable-baselines3")
 
 
@@ -126,6 +128,30 @@ def read_json(path: Path | str) -> Any:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DataFileError(f"expected a readable JSON file at {path}: {error}; delete it to have it made again") from error
+
+
+def write_sealed(path: Path | str, content: bytes) -> None:
+    """Write ``content`` atomically, behind its SHA-256."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+
+
+def read_sealed(path: Path | str) -> bytes:
+    """The content that :func:`write_sealed` wrote; DataFileError where a single bit of the file is another."""
+    try:
+        whole = Path(path).read_bytes()
+    except OSError as error:
+        raise DataFileError(f"{path}: expected a file that can be read, got {error}; delete it to start anew") from error
+    end = len(SEAL) + 64
+    if not whole.startswith(SEAL):
+        raise DataFileError(
+            f"{path}: expected a file that begins with {SEAL.decode()!r} and the SHA-256 of the rest, got {whole[:16]!r}: an "
+            "older version wrote it, or it is damaged; delete it to start anew"
+        )
+    kept, came = whole[len(SEAL) : end + 1], hashlib.sha256(whole[end + 1 :]).hexdigest()
+    if kept != came.encode() + b"\n":
+        raise DataFileError(f"{path}: expected content of SHA-256 {kept!r}, got {came}: damaged; delete it to start anew")
+    return whole[end + 1 :]
 
 
 def hash_of(content: Any) -> str:

@@ -289,9 +289,53 @@ def test_saved_training_of_other_settings_is_not_continued_and_a_damaged_one_is_
     assert second.epoch == 0
     second.resume(state, "this one")
     assert second.epoch == 1
-    state.write_bytes(state.read_bytes()[:-5])
+    whole = state.read_bytes()
+    state.write_bytes(whole[:-5])
     with pytest.raises(DataFileError, match="start anew"):
         second.resume(state, "this one")
+    state.write_bytes(unsealed(whole))  # as versions before wrote it
+    with pytest.raises(DataFileError, match="an older version wrote it"):
+        second.resume(state, "this one")
+    assert state.exists()
+
+
+def unsealed(whole: bytes) -> bytes:
+    return whole.split(b"\n", 1)[1]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.05, 0.5, 0.999])
+def test_one_flipped_bit_of_a_saved_training_is_noticed(share: float, tmp_path: Path) -> None:
+    data, state = closed_form_data(60), tmp_path / "net.state.safetensors"
+    net, rows = _start(data, QUICK)
+    some = data.split()["train"]
+    first = Descent(net, rows, some, some, QUICK)
+    first.run_epoch()
+    first.save(state, "this one")
+    content = bytearray(state.read_bytes())
+    content[int(share * len(content))] ^= 4
+    state.write_bytes(content)
+    with pytest.raises(DataFileError, match="damaged"):
+        Descent(net, rows, some, some, QUICK).resume(state, "this one")
+
+
+def test_training_stops_when_nothing_helps_and_keeps_the_best_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = [0.9, 0.5, 0.7, 0.4, 0.6, 0.41, 0.8]  # best after the fourth epoch; the fifth to the seventh do not help
+    left, kept = iter(errors), []
+    monkeypatch.setattr(descent, "validation_error", lambda net, rows: next(left))
+    run_epoch = Descent.run_epoch
+
+    def watched(self: Descent) -> float:
+        loss = run_epoch(self)
+        kept.append([p.detach().clone() for p in self.net.parameters()])
+        return loss
+
+    monkeypatch.setattr(Descent, "run_epoch", watched)
+    net, card = train(closed_form_data(60), replace(QUICK, patience=3), progress=False)
+    assert card["epochs"] == len(kept) == 7 < QUICK.epochs
+    assert card["validation_error"] == 0.4
+    for value, best, last in zip(net.parameters(), kept[3], kept[-1], strict=True):
+        assert torch.equal(value, best)
+        assert not torch.equal(value, last)
 
 
 def test_tensorboard_gets_loss_and_error(tmp_path: Path) -> None:
