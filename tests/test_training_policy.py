@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +13,7 @@ import torch
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
+from surrogate.storage import read_sealed, write_sealed
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.scene_ranges import scene_ranges
@@ -67,8 +70,14 @@ def test_killed_training_goes_on_with_the_same_bits(
     torch.manual_seed(99)
     with pytest.raises(DataFileError, match="settings"):
         train_policy(scene, PolicyConfig(**{**vars(config), "seed": 5}), progress=False, state=state)
+    content = torch.load(io.BytesIO(read_sealed(state)), weights_only=True)
+    assert 0 < content["past"]["simulating"] < content["past"]["seconds"]
+    content["past"] |= {"seconds": 1000.0, "simulating": 500.0}
+    save_content(state, content)
     resumed, card = train_policy(scene, config, progress=False, state=state)
     assert card["simulator_calls"] == config.calls
+    assert 1000 < card["seconds"] < 1100  # what was spent before the kill counts
+    assert 500 < card["simulating_seconds"] < 600
     for name, values in whole[config.calls].layers.state_dict().items():
         assert torch.equal(values, resumed[config.calls].layers.state_dict()[name])
     assert not state.exists()
@@ -76,14 +85,67 @@ def test_killed_training_goes_on_with_the_same_bits(
 
 def test_a_damaged_or_foreign_training_state_is_named(tmp_path: Path) -> None:
     state = tmp_path / "policy.training"
+
+    def refused(match: str) -> None:
+        with pytest.raises(DataFileError, match=match):
+            train_policy(QUICK, SMALL, progress=False, state=state)
+
     state.write_bytes(b"no checkpoint")
-    with pytest.raises(DataFileError, match="whole checkpoint"):
+    refused("begins with")
+    torch.save({"format": "tensegrity_gym.policy_training/1"}, state)  # as versions before wrote it
+    refused("an older version wrote it")
+    assert state.exists()
+    write_sealed(state, b"no checkpoint")
+    refused("whole checkpoint")
+    save_content(state, {"format": "another", "code": print})  # a pickle that names code is not run
+    refused("whole checkpoint")
+    save_content(state, {"format": "another"})
+    refused("format")
+
+
+def save_content(path: Path, content: Any) -> None:
+    """Write a checkpoint of any content, as the training writes its own."""
+    file = io.BytesIO()
+    torch.save(content, file)
+    write_sealed(path, file.getvalue())
+
+
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The checkpoint of a training that was killed."""
+    state = tmp_path_factory.mktemp("unfinished") / "policy.training"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module._Watch, "keep", lambda self: _stop(state))
+        with pytest.raises(KeyboardInterrupt):
+            train_policy(QUICK, SMALL, progress=False, state=state)
+    return state.read_bytes()
+
+
+def _stop(state: Path) -> None:
+    if state.exists():
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.999])
+def test_one_flipped_bit_of_a_training_state_is_noticed(share: float, tmp_path: Path, unfinished: bytes) -> None:
+    state, content = tmp_path / "policy.training", bytearray(unfinished)
+    content[int(share * len(content))] ^= 4
+    state.write_bytes(content)
+    with pytest.raises(DataFileError, match="damaged"):
         train_policy(QUICK, SMALL, progress=False, state=state)
-    torch.save({"format": "another", "code": print}, state)  # a pickle that names code is not run
-    with pytest.raises(DataFileError, match="whole checkpoint"):
-        train_policy(QUICK, SMALL, progress=False, state=state)
-    torch.save({"format": "another"}, state)
-    with pytest.raises(DataFileError, match="format"):
+
+
+def test_a_training_state_that_lacks_a_part_is_named(tmp_path: Path, unfinished: bytes) -> None:
+    state = tmp_path / "policy.training"
+    state.write_bytes(unfinished)
+    content = torch.load(io.BytesIO(read_sealed(state)), weights_only=True)
+    for wrong in ({"parameters": None}, {"buffer": {"pos": 0}}, {"past": {}}, {"numpy_rng": 3}):
+        save_content(state, content | wrong)
+        with pytest.raises(DataFileError, match="all that a SAC needs"):
+            train_policy(QUICK, SMALL, progress=False, state=state)
+    del content["variables"]
+    save_content(state, content)
+    with pytest.raises(DataFileError, match=r"KeyError.*variables"):
         train_policy(QUICK, SMALL, progress=False, state=state)
 
 

@@ -1,30 +1,42 @@
 """The whole state of a policy's training in one file, from which it goes on bit by bit.
 
 stable-baselines3's own zips are pickles: loading one runs whatever code is in it. This file holds tensors and plain numbers
-alone, and is read with ``weights_only``, which refuses anything else.
+alone, and is read with ``weights_only``, which refuses anything else. torch looks at no checksum of tensors: the file is sealed.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecEnv
 
-from surrogate.storage import atomic_path, ensure_folder
+from surrogate.storage import ensure_folder, read_sealed, write_sealed
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.errors import DataFileError
 
-FORMAT = "tensegrity_gym.policy_training/1"
+FORMAT = "tensegrity_gym.policy_training/2"
 BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-def save(path: Path, model: Any, settings: str, actors: dict[int, dict[str, torch.Tensor]]) -> None:
+class Past(NamedTuple):
+    """What a training has behind it, besides the state of its model."""
+
+    actors: dict[int, dict[str, torch.Tensor]]
+    """Weights of the actors kept so far, by the hops that they had seen."""
+    seconds: float
+    """Wall time that it took [s]."""
+    simulating: float
+    """Of that, in the simulator [s]."""
+
+
+def save(path: Path, model: Any, settings: str, past: Past) -> None:
     """Write the state of ``model`` between two rollouts; ``settings`` is a hash of all that decides its training."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 (stable-baselines3 draws from it)
     assert kind == "MT19937"
@@ -40,12 +52,13 @@ def save(path: Path, model: Any, settings: str, actors: dict[int, dict[str, torc
         "torch_rng": torch.get_rng_state(),
         "numpy_rng": [torch.from_numpy(np.asarray(keys).astype(np.int64)), position, has_gauss, gauss],
         "action_rng": json.dumps(model.action_space.np_random.bit_generator.state),
-        "actors": actors,
+        "past": past._asdict(),
         "buffer": _buffer(model),
     }
     ensure_folder(path.parent)
-    with atomic_path(path) as temporary:
-        torch.save(content, temporary)
+    file = io.BytesIO()
+    torch.save(content, file)
+    write_sealed(path, file.getvalue())
 
 
 def _buffer(model: Any) -> dict[str, Any] | None:
@@ -57,15 +70,16 @@ def _buffer(model: Any) -> dict[str, Any] | None:
     return {"pos": buffer.pos, "full": buffer.full, "columns": columns}
 
 
-def restore(path: Path, model: Any, venv: VecEnv, settings: str) -> dict[int, dict[str, torch.Tensor]]:
-    """Put the state in ``path`` into a newly built ``model`` on a new ``venv``; returns the actors kept so far.
+def restore(path: Path, model: Any, venv: VecEnv, settings: str) -> Past:
+    """Put the state in ``path`` into a newly built ``model`` on a new ``venv``; returns what lies behind it.
 
     DataFileError for a damaged file, or one of another training.
     """
+    file = io.BytesIO(read_sealed(path))
     try:
-        content = torch.load(path, weights_only=True)
-    except (OSError, RuntimeError, pickle.UnpicklingError, EOFError, ValueError) as error:
-        raise DataFileError(f"{path}: expected a whole checkpoint of a policy's training ({error}); delete it") from error
+        content = torch.load(file, weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, TypeError) as error:
+        raise DataFileError(f"{path}: expected a whole checkpoint of a policy's training ({error!r}); delete it") from error
     expected = {"format": FORMAT, "model_version": MODEL_VERSION, "settings": settings}
     for name, value in expected.items():
         came = content.get(name) if isinstance(content, dict) else None
@@ -73,6 +87,17 @@ def restore(path: Path, model: Any, venv: VecEnv, settings: str) -> dict[int, di
             raise DataFileError(
                 f"{path}: expected a checkpoint with {name} {value!r}, got {came!r}; delete it, or choose another --out"
             )
+    try:
+        return _take(content, model, venv)
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise DataFileError(
+            f"{path}: expected a checkpoint with all that a {type(model).__name__} needs, got one that lacks or misshapes it "
+            f"({error!r}); delete it"
+        ) from error
+
+
+def _take(content: dict[str, Any], model: Any, venv: VecEnv) -> Past:
+    past = Past(**content["past"])
     model.set_parameters(content["parameters"], exact_match=True, device="cpu")
     for name, values in content["variables"].items():
         recursive_getattr(model, name).data.copy_(values)
@@ -90,4 +115,4 @@ def restore(path: Path, model: Any, venv: VecEnv, settings: str) -> dict[int, di
     keys, position, has_gauss, gauss = content["numpy_rng"]
     np.random.set_state(("MT19937", keys.numpy().astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
     torch.set_rng_state(content["torch_rng"])
-    return content["actors"]
+    return past

@@ -79,12 +79,26 @@ class _Watch(BaseCallback):
     """Moves the progress bar, copies the actor whenever a budget of simulator calls is spent, and writes checkpoints."""
 
     def __init__(
-        self, config: PolicyConfig, budgets: Sequence[int], scaling: Scaling, bar: tqdm, path: Path | None, settings: str
+        self,
+        config: PolicyConfig,
+        budgets: Sequence[int],
+        scaling: Scaling,
+        bar: tqdm,
+        path: Path | None,
+        settings: str,
+        hops: BatchedHopVecEnv,
+        started: float,
     ):
         super().__init__()
         self.config, self.budgets, self.scaling, self.bar = config, sorted(budgets), scaling, bar
         self.path, self.settings, self.written = path, settings, 0
+        self.hops, self.started = hops, started
+        self.before = self.simulated_before = 0.0  # seconds that earlier runs took
         self.snapshots: dict[int, ActorPolicy] = {}
+
+    def seconds(self) -> tuple[float, float]:
+        """Wall time of this training so far, and that in the simulator, over all its runs [s]."""
+        return self.before + time.perf_counter() - self.started, self.simulated_before + self.hops.seconds
 
     def _on_step(self) -> bool:
         self.bar.update(self.num_timesteps - self.bar.n)
@@ -98,7 +112,7 @@ class _Watch(BaseCallback):
         done = self.model.num_timesteps
         if self.path is not None and done - self.written >= self.config.checkpoint_every:
             actors = {budget: actor.layers.state_dict() for budget, actor in self.snapshots.items()}
-            checkpoint.save(self.path, self.model, self.settings, actors)
+            checkpoint.save(self.path, self.model, self.settings, checkpoint.Past(actors, *self.seconds()))
             self.written = done
 
     def keep(self) -> None:
@@ -107,11 +121,12 @@ class _Watch(BaseCallback):
             if self.model.num_timesteps >= budget and budget not in self.snapshots:
                 self.snapshots[budget] = ActorPolicy.from_model(self.model, self.scaling)
 
-    def resume(self, model: Any, actors: dict[int, Any]) -> None:
-        """Go on with the actors of a checkpoint."""
+    def resume(self, model: Any, past: checkpoint.Past) -> None:
+        """Go on from a checkpoint."""
         self.written = model.num_timesteps
         self.bar.update(model.num_timesteps)
-        for budget, weights in actors.items():
+        self.before, self.simulated_before = past.seconds, past.simulating
+        for budget, weights in past.actors.items():
             self.snapshots[budget] = ActorPolicy.from_model(model, self.scaling)
             self.snapshots[budget].layers.load_state_dict(weights)
 
@@ -150,7 +165,7 @@ def train_policy(
             tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
         )
         model = build(config.algorithm, values, venv, config.calls, config.seed, tensorboard)
-        watch = _Watch(config, [*budgets, config.calls], scaling, bar, state, settings)
+        watch = _Watch(config, [*budgets, config.calls], scaling, bar, state, settings, hops, started)
         before = 0
         if state is not None and state.exists():
             watch.resume(model, checkpoint.restore(state, model, venv, settings))
@@ -164,7 +179,8 @@ def train_policy(
     if state is not None:
         state.unlink(missing_ok=True)
     card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": told, "simulator_calls": calls}
-    return watch.snapshots, card | {"seconds": time.perf_counter() - started, "simulating_seconds": hops.seconds}
+    seconds, simulating = watch.seconds()
+    return watch.snapshots, card | {"seconds": seconds, "simulating_seconds": simulating}
 
 
 def _evaluation(stack: contextlib.ExitStack, scenes: SceneRanges, scaling: Scaling, config: PolicyConfig) -> EvalCallback:
