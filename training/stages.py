@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -19,7 +20,8 @@ class Stages:
     """Runs stages in ``folder``; records lie in ``folder``/stages, one JSON file each.
 
     A record's hash covers the stage's settings, the version of the physics and the hashes of the stages it needs, so a
-    change anywhere upstream makes a stage run again.
+    change anywhere upstream makes a stage run again. Another covers its results, so that those which someone edited, or a
+    disk damaged, are not taken for what the stage found; records from before there was one count as whole.
     """
 
     def __init__(self, folder: Path, say: Callable[[str], None] = print) -> None:
@@ -43,6 +45,9 @@ class Stages:
         wanted = hash_of(content)
         path = self.records / f"{name}.json"
         record = self._record(path)
+        if record.get("hash") == wanted and not _whole(record):
+            self.say(f"{name}: expected results of hash {record.get('results_hash')}, its record holds others: run again")
+            record = {}
         if record.get("hash") == wanted and all((self.folder / f).is_file() for f in files):
             self.say(f"{name}: done before, kept")
             self.skipped.append(name)
@@ -52,6 +57,7 @@ class Stages:
             seconds = results.get("seconds", time.perf_counter() - started)
             date = datetime.now(UTC).isoformat(timespec="seconds")
             record = {"hash": wanted, **content, "seconds": seconds, "date": date, "results": results}
+            record["results_hash"] = _results_hash(record)
             write_json(path, record)
             self.say(f"{name}: {seconds:.1f} s")
         self.hashes[name] = wanted
@@ -68,3 +74,15 @@ class Stages:
         except DataFileError:
             return {}  # a damaged record proves nothing: run the stage again
         return record if isinstance(record, dict) else {}
+
+
+def _results_hash(record: dict[str, Any]) -> str:
+    """Hash of what a stage found, as it is read back: JSON knows no tuples, and no keys but text."""
+    return hash_of(json.loads(json.dumps([record["results"], record["seconds"]])))
+
+
+def _whole(record: dict[str, Any]) -> bool:
+    """Whether a record holds what its stage found, as far as it can tell."""
+    if not {"results", "seconds", "date"} <= set(record):
+        return False
+    return "results_hash" not in record or record["results_hash"] == _results_hash(record)
