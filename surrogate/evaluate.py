@@ -12,12 +12,13 @@ import tyro
 
 from surrogate import dataset, model
 from surrogate.dataset import SPLITS, HopData
+from surrogate.hops import PHYSICS, check_parts
 from surrogate.kriging import fit_process
 from surrogate.model import HopNet
 from surrogate.outputs import OUTPUTS, target_columns
 from surrogate.scores import LEVELS, PLANES, coverage, disagreement, nearest_hop_noise, of_data, ranking, rmse, speed, spread
 from surrogate.storage import ensure_folder, write_json
-from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.types import Floats
 
 
@@ -124,12 +125,9 @@ def evaluate(
 
 def rows_of(config: EvaluateConfig, data: HopData, card: dict[str, Any]) -> HopData:
     """The hops that ``config.split`` names; DataFileError where the net was trained on another configuration."""
-    for name in ("model_version", "design", "scene", "lattice", "scene_ranges", "fidelity"):
-        if card["configuration"].get(name) != data.configuration.get(name):
-            raise DataFileError(
-                f"{config.data}: expected {name} {card['configuration'].get(name)!r}, which the surrogate was trained on, "
-                f"got {data.configuration.get(name)!r}; use data of the same configuration"
-            )
+    names = (*PHYSICS, "scene", "scene_ranges")
+    why, fix = "which the surrogate was trained on", "use data of the same configuration"
+    check_parts(data.configuration, card["configuration"], names, str(config.data), why, fix)
     if config.split == "all":
         rows = data.rows(data.usable)
     elif config.split in SPLITS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -28,6 +28,9 @@ from tensegrity_gym.energies import centre_of_mass
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.fidelity import Fidelity, changed, named_fidelity
 from tensegrity_gym.types import Floats, Ints
+
+#: Parts of a configuration that, with scene and ranges, decide where a hop of given stretches lands.
+PHYSICS = ("fidelity", "dt", "model_version", "design", "lattice")
 
 
 @dataclass(frozen=True)
@@ -275,6 +278,23 @@ def concatenate(parts: list[HopData]) -> HopData:
         check_configuration(part.configuration, parts[0].configuration, "the second part")
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].columns}
     return HopData(columns, parts[0].configuration, sum(p.seconds for p in parts))
+
+
+def check_parts(
+    came: Mapping[str, Any], expected: Mapping[str, Any], names: Iterable[str], where: str, why: str, fix: str
+) -> None:
+    """DataFileError for the first of the parts ``names`` that two configurations have different.
+
+    ``why`` says whose the expected one is, ``fix`` what to do.
+    """
+    for name in names:
+        theirs, ours = came.get(name), expected.get(name)
+        if theirs == ours:
+            continue
+        if isinstance(theirs, Mapping) and isinstance(ours, Mapping):  # only what differs is worth reading
+            different = [k for k in sorted({*theirs, *ours}) if theirs.get(k) != ours.get(k)]
+            theirs, ours = ({k: part.get(k) for k in different} for part in (theirs, ours))
+        raise DataFileError(f"{where}: expected {name} {ours!r}, {why}, got {theirs!r}; {fix}")
 
 
 def check_configuration(came: dict[str, Any], expected: dict[str, Any], where: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 
 from surrogate import dataset
+from surrogate.dataset import HopData
+from surrogate.generate import GenerateConfig, configuration_of
 from tensegrity_gym import Scene, form_find, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.fidelity import FIDELITIES
 from tensegrity_gym.scene_ranges import scene_ranges
 from tensegrity_gym.task import reach, reachable
 from training.compare import report, run
@@ -148,7 +152,7 @@ def test_text_is_put_between_its_markers_alone(tmp_path: Path) -> None:
 
 
 def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path, folder: Path) -> None:
-    small = replace(CompareConfig(out=tmp_path, progress=False), data=folder / "hops_0_0_32.h5", budgets=(8,))
+    small = CompareConfig(out=tmp_path, progress=False, fidelity="flown", data=folder / "hops_0_0_32.h5", budgets=(8,))
     with pytest.raises(DataFileError, match="expected hops in"):
         run.Comparison(replace(small, scene="moon")).pool(0)
     with pytest.raises(DataFileError, match="at least 64"):
@@ -156,6 +160,43 @@ def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path,
     for changes in ({"budgets": (2,)}, {"seeds": (0,)}, {"seeds": (1, 2)}, {"policy_seeds": (1, 2)}, {"algorithms": ("dqn",)}):
         with pytest.raises(InvalidParameterError, match=next(iter(changes))):
             CompareConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_data_of_another_physics_are_refused(tmp_path: Path, folder: Path) -> None:
+    """What planners learn from must be made as their answers are scored."""
+    data, path = dataset.read(folder / "hops_0_0_32.h5"), tmp_path / "hops.h5"
+    config = CompareConfig(out=tmp_path, progress=False, fidelity="flown", data=path, budgets=(8,))
+
+    def pool(asked: str = "flown", **changes: object) -> HopData:
+        dataset.write(path, HopData(data.columns, data.configuration | changes))
+        return run.Comparison(replace(config, fidelity=asked)).pool(0)
+
+    assert len(pool()) == 8
+    made, _, _ = configuration_of(GenerateConfig(path, landing="touchdown", fidelity="flown"))
+    assert len(pool(**made.as_dict())) == 8
+    usual, _, _ = configuration_of(GenerateConfig(path, landing="touchdown"))  # the paper's model, in single precision
+    assert len(pool("single", **usual.as_dict())) == 8
+    with pytest.raises(DataFileError, match=r"expected fidelity .*'precision': 'float64'.*compare with --fidelity single"):
+        pool("paper", **usual.as_dict())
+    with pytest.raises(DataFileError, match=r"expected fidelity .*scored with --fidelity paper.*compare with --fidelity flown"):
+        pool("paper")
+    others = {"model_version": "1", "dt": 1e-5, "design": data.configuration["design"] | {"bar_density": 1500.0}}
+    for name, value in others.items():
+        with pytest.raises(DataFileError, match=f"expected {name} .*use another file"):
+            pool(**{name: value})
+
+
+def test_older_files_of_a_comparison_are_known_by_its_record(tmp_path: Path, folder: Path) -> None:
+    """They named the paper's model whichever it was."""
+    shutil.copytree(folder, tmp_path / "quick")
+    path = tmp_path / "quick" / "hops_0_0_32.h5"
+    data = dataset.read(path)
+    assert data.configuration["fidelity"] == FIDELITIES["flown"].levers()
+    paper = {"fidelity": FIDELITIES["paper"].levers(), "precision": "float64"}
+    dataset.write(path, HopData(data.columns, data.configuration | paper))
+    again = run.Comparison(CompareConfig(out=tmp_path, quick=True, progress=False).shortened())
+    assert again.pool(0).configuration == data.configuration
+    assert again.stages.skipped == ["hops_0_0_32"]
 
 
 def test_targets_of_varied_scenes_lie_where_they_should_in_their_own_scene() -> None:

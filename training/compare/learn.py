@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,11 +16,14 @@ from torch import Tensor
 from surrogate import dataset, model
 from surrogate.dataset import Configuration, HopData
 from surrogate.frozen import FrozenLanding
+from surrogate.hops import PHYSICS, check_parts
 from surrogate.kriging import fit_kriging
 from surrogate.model import HopNet
 from surrogate.train import train
-from tensegrity_gym import Scene
+from tensegrity_gym import Design, Lattice, Scene
+from tensegrity_gym.auto import choose_fidelity
 from tensegrity_gym.errors import DataFileError
+from tensegrity_gym.fidelity import FIDELITIES, Fidelity, named_fidelity
 from tensegrity_gym.scene_ranges import SceneRanges
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
@@ -39,13 +43,17 @@ def simulated(hops: Hops, stretches: np.ndarray, seed: int) -> HopData:
     """Hops of ``stretches`` as data; its wall time is what they took."""
     started = time.perf_counter()
     result = hops.simulate(stretches)
-    configuration = Configuration(scene=hops.scene, seed=seed)
+    configuration = Configuration(scene=hops.scene, seed=seed, fidelity=result.fidelity)
     return dataset.from_result(result, configuration, time.perf_counter() - started)
 
 
-def from_file(path: Path, scenes: SceneRanges, seed: int, most: int) -> HopData:
-    """``most`` hops of a file, from its ``seed``-th tenth on, with their landing read where the scenes say."""
+def from_file(path: Path, scenes: SceneRanges, fidelity: str, seed: int, most: int) -> HopData:
+    """``most`` hops of a file, from its ``seed``-th tenth on, with their landing read where the scenes say.
+
+    They must be hops of the model that ``fidelity`` names: answers are scored with it.
+    """
     data, scene = dataset.read(path), scenes.base
+    _check_physics(data.configuration, scene, fidelity, path)
     kept, ranges = Scene(**data.configuration["scene"]), data.configuration["scene_ranges"]
     same = replace(kept, landing=scene.landing, duration=scene.duration, **{n: getattr(scene, n) for n in scenes.observed})
     wanted = {name: list(bounds) for name, bounds in scenes.ranges.items()}
@@ -60,6 +68,19 @@ def from_file(path: Path, scenes: SceneRanges, seed: int, most: int) -> HopData:
     columns = rows.columns | {"landing": rows[scene.landing].copy()}
     seconds = float(columns["cpu_seconds"].sum()) if "cpu_seconds" in columns else data.seconds * most / len(data)
     return HopData(columns, configuration, seconds)
+
+
+def model_of(fidelity: str, scene: Scene) -> Fidelity:
+    """The model of the hop that the name means in ``scene``."""
+    return choose_fidelity(Design(), scene, Lattice()) if fidelity == "auto" else named_fidelity(fidelity)
+
+
+def _check_physics(came: Mapping[str, Any], scene: Scene, fidelity: str, path: Path) -> None:
+    model = model_of(fidelity, scene)
+    fitting = [name for name, known in FIDELITIES.items() if known.levers() == came.get("fidelity")]
+    fix = f"compare with --fidelity {fitting[0]}, or use" if fitting and named_fidelity(fitting[0]) != model else "use"
+    expected, why = Configuration(scene=scene, fidelity=model).as_dict(), f"as answers are scored with --fidelity {fidelity}"
+    check_parts(came, expected, PHYSICS, str(path), why, f"{fix} another file, or none")
 
 
 def _and(ranges: Mapping[str, Sequence[float]]) -> str:

@@ -21,7 +21,7 @@ from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
-from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, save_net, simulated
+from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, model_of, save_net, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.planner import BestOfPlanner, NearestHopPlanner, Planner
 from training.policies import ActorPolicy
@@ -99,7 +99,7 @@ class Comparison:
             return self._pools[seed]
         most = max(self.config.budgets)
         if self.config.data is not None:
-            found = from_file(self.config.data, self.scenes, seed, most)
+            found = from_file(self.config.data, self.scenes, self.config.fidelity, seed, most)
         else:
             found = dataset.concatenate([self._block(seed, k, most) for k in range(0, most, BLOCK)])
         self._pools = {seed: found}  # one at a time in memory
@@ -124,7 +124,10 @@ class Comparison:
             return {"seconds": part.seconds}
 
         self.stages.run(path.stem, self.base | {"seed": seed, "first": first, "last": last}, work, files=[path.name])
-        return dataset.read(path)
+        found, made = dataset.read(path), model_of(self.config.fidelity, self.scene)
+        # older files name the paper's model whichever made them; the stage's record knows
+        configuration = found.configuration | {"fidelity": made.levers(), "precision": made.precision}
+        return HopData(found.columns, configuration, found.seconds)
 
     def _floor(self) -> None:
         def work() -> Results:
