@@ -160,6 +160,9 @@ def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path,
     for changes in ({"budgets": (2,)}, {"seeds": (0,)}, {"seeds": (1, 2)}, {"policy_seeds": (1, 2)}, {"algorithms": ("dqn",)}):
         with pytest.raises(InvalidParameterError, match=next(iter(changes))):
             CompareConfig(**changes)  # type: ignore[arg-type]
+    with pytest.raises(InvalidParameterError, match=r"cut off after 0.06 s would overwrite"):
+        CompareConfig(quick=True, write=True)
+    assert not CompareConfig(quick=True).shortened().write
 
 
 def test_data_of_another_physics_are_refused(tmp_path: Path, folder: Path) -> None:

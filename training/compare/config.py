@@ -84,6 +84,11 @@ class CompareConfig:
     """Show progress bars."""
 
     def __post_init__(self) -> None:
+        if self.quick and self.write:
+            raise InvalidParameterError(
+                "write: expected it without --quick, got both: hops cut off after 0.06 s would overwrite the measured results in "
+                "README.md and docs; leave one of them out"
+            )
         counts = {"seeds": min(self.seeds, default=0), "perturbations": self.perturbations, "updates": self.updates}
         for name, value in counts.items():
             if value < 1:
