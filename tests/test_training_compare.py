@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from surrogate import dataset
 from surrogate.dataset import HopData
@@ -200,6 +201,41 @@ def test_older_files_of_a_comparison_are_known_by_its_record(tmp_path: Path, fol
     again = run.Comparison(CompareConfig(out=tmp_path, quick=True, progress=False).shortened())
     assert again.pool(0).configuration == data.configuration
     assert again.stages.skipped == ["hops_0_0_32"]
+
+
+def test_what_is_left_out_without_cma_is_said(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(folder, tmp_path / "quick")
+    monkeypatch.setattr(run, "find_spec", lambda name: None)
+    config = replace(
+        CompareConfig(out=tmp_path, quick=True, progress=False).shortened(), budgets=(32,), seeds=(1,), algorithms=(), latencies=0
+    )
+    comparison, said = run.Comparison(config), []
+    comparison.stages.say = said.append
+    comparison.run()
+    assert "pip install 'tensegrity-gym[cma]'" in said[0]
+    assert not {"oracle", "score_cma_0_32", "score_oracle_0_32"} & set(comparison.stages.results)
+
+
+def test_every_method_is_timed_on_one_thread_and_often_enough(tmp_path: Path) -> None:
+    class Asked:
+        def __init__(self) -> None:
+            self.threads: list[int] = []
+
+        def predict(self, target: np.ndarray) -> None:
+            self.threads.append(torch.get_num_threads())
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        comparison = run.Comparison(CompareConfig(out=tmp_path, latencies=40, progress=False))
+        for name, count in (("tandem", 40), ("best8", 20), ("refine8", 20)):
+            asked = Asked()
+            assert len(comparison._questions(asked, name)) == count  # type: ignore[arg-type]
+            assert asked.threads == [1] * (count + 2)
+        comparison.config = replace(comparison.config, latencies=4)
+        assert len(comparison._questions(Asked(), "best8")) == 10  # type: ignore[arg-type]
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_targets_of_varied_scenes_lie_where_they_should_in_their_own_scene() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
-from surrogate.model import HopNet
+from surrogate.model import HopNet, one_thread
 from tensegrity_gym.task import check_fidelity, reach
 from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import targets as registered
@@ -76,6 +76,8 @@ class Comparison:
     def run(self) -> None:
         """All stages, cheap ones first."""
         config = self.config
+        if not find_spec("cma"):
+            self.stages.say("cma: not installed, so its rows and the oracle are left out; pip install 'tensegrity-gym[cma]'")
         self._floor()
         for seed, budget in config.planner_runs:
             self._planners(seed, budget)
@@ -307,10 +309,11 @@ class Comparison:
 
         needs = [f"net_0_{budget}", *policies.values()]
         content = {"questions": self.config.latencies, "tries": self.config.tries, "refine": self.config.refine}
-        self.stages.run("latency", content, work, needs=needs)
+        how = {"threads": 1}  # of torch; times from before, with all, are measured again
+        self.stages.run("latency", content | how, work, needs=needs)
         if self.config.bayes and self.config.bayes_seeds != 0:  # apart, so that the others' times stay as they were
             name, tries = f"bayes{self.config.bayes}", self.config.bayes
-            content = {"questions": self.config.latencies, "tries": tries, "process": asdict(BayesianConfig())}
+            content = {"questions": self.config.latencies, "tries": tries, "process": asdict(BayesianConfig())} | how
             self.stages.run(
                 f"latency_{name}",
                 content,
@@ -321,14 +324,15 @@ class Comparison:
     def _questions(self, planner: Planner, name: str) -> list[float]:
         """Wall times of single questions [s], after two to warm up."""
         slow = name.startswith(tuple(SIMULATING))
-        count = max(2, self.config.latencies // 10) if slow else self.config.latencies
+        count = max(10, self.config.latencies // 2) if slow else self.config.latencies
         rng = np.random.default_rng(LATENCY_SEED)
         inside = self.places["inside"]
         times = []
-        for target in inside[rng.integers(len(inside), size=count + 2)]:
-            started = time.perf_counter()
-            planner.predict(target)
-            times.append(time.perf_counter() - started)
+        with one_thread():  # as planners ask their nets: tandem, CMA-ES and policies are timed alike
+            for target in inside[rng.integers(len(inside), size=count + 2)]:
+                started = time.perf_counter()
+                planner.predict(target)
+                times.append(time.perf_counter() - started)
         return times[2:]
 
 
