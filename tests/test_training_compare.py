@@ -13,6 +13,7 @@ import torch
 
 from surrogate import dataset
 from surrogate.dataset import HopData
+from surrogate.frozen import FrozenLanding
 from surrogate.generate import GenerateConfig, configuration_of
 from tensegrity_gym import Scene, form_find, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
@@ -25,6 +26,7 @@ from training.compare.config import CompareConfig
 from training.compare.hops import PERTURBATION, Hops, VariedHops, repeated
 from training.compare.results import Outcome
 from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
+from training.inverse import InversePlanner
 
 QUICK = Scene(duration=0.05)
 
@@ -238,6 +240,23 @@ def test_every_method_is_timed_on_one_thread_and_often_enough(tmp_path: Path) ->
         torch.set_num_threads(before)
 
 
+def test_one_net_is_asked_alone_and_cards_tell_what_it_learnt_from(folder: Path) -> None:
+    comparison = run.Comparison(CompareConfig(out=folder.parent, quick=True, progress=False).shortened())
+    comparison._floor()
+    fitted = comparison.fitted(1, 32)
+    stretches = torch.rand(50, 4, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.2
+    single = fitted["single"]
+    assert isinstance(single, InversePlanner)
+    assert isinstance(single.landing, FrozenLanding)
+    assert len(single.landing.first) == single.landing(stretches).shape[0] == 1
+    torch.testing.assert_close(single.landing(stretches), fitted.landing(stretches)[:1], rtol=0, atol=1e-6)
+    card = json.loads((folder / "net_1_32.json").read_text())
+    assert card["data_digest"] == comparison.learnt(1, 32).digest
+    assert card["train"]["seed"] == 1
+    assert set(card["rmse"]) >= {"train"}
+    assert card["configuration"]["fidelity"] == FIDELITIES["flown"].levers()
+
+
 def test_targets_of_varied_scenes_lie_where_they_should_in_their_own_scene() -> None:
     places = registered.read("varied", "touchdown")
     assert {p: len(t) for p, t in places.items()} == registered.COUNTS
@@ -299,6 +318,19 @@ def test_comparison_of_varied_scenes_tells_all_in_reaches_and_goes_on_after_a_lo
     own = [reach(again.hops.at(row[2:])) for row in inside]
     wanted = np.linalg.norm(landings - inside[:, None, :2], axis=2).mean(axis=1) / own
     np.testing.assert_allclose(outcome.errors("ensemble", 32)[1], wanted)
+
+
+def test_one_net_is_asked_alone_in_each_scene(varied_folder: Path) -> None:
+    config = CompareConfig(out=varied_folder.parent, scene="varied", quick=True, progress=False).shortened()
+    comparison = run.comparison_of(config)
+    comparison._floor()
+    fitted = comparison.fitted(0, 32)
+    stretches = torch.rand(50, 4, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.2
+    for values in (np.array([9.0, 0.4]), np.array([2.0, 0.7])):
+        landing, whole = fitted._of_one_net(values).landing, fitted.landing.at(values)(stretches)
+        assert isinstance(landing, FrozenLanding)
+        assert len(landing.first) == landing(stretches).shape[0] == 1
+        torch.testing.assert_close(landing(stretches), whole[:1], rtol=0, atol=1e-6)
 
 
 def test_data_of_varied_scenes_are_taken_from_a_file_that_fits(varied_folder: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate import dataset, model
+from surrogate import dataset
 from surrogate.dataset import Configuration, HopData
 from surrogate.frozen import FrozenLanding
 from surrogate.hops import PHYSICS, check_parts
@@ -87,11 +87,10 @@ def _and(ranges: Mapping[str, Sequence[float]]) -> str:
     return "".join(f", {name} from {low:g} to {high:g}" for name, (low, high) in ranges.items())
 
 
-def fit_net(data: HopData, config: CompareConfig, seed: int) -> tuple[HopNet, float]:
-    """The surrogate trained on ``data``, and how long that took [s]."""
+def fit_net(data: HopData, config: CompareConfig, seed: int) -> tuple[HopNet, dict[str, Any]]:
+    """The surrogate trained on ``data``, and its card."""
     settings = replace(config.surrogate, seed=seed, steps=min(config.surrogate.steps, config.updates))
-    net, card = train(data, settings, progress=config.progress, desc=f"surrogate of {len(data)} hops")
-    return net, float(card["seconds"])
+    return train(data, settings, progress=config.progress, desc=f"surrogate of {len(data)} hops")
 
 
 class Fitted:
@@ -113,7 +112,7 @@ class Fitted:
             make: dict[str, Callable[[], Planner]] = {
                 "nearest": lambda: NearestHopPlanner(self.data["stretches"], self.data["landing"], images=self.images),
                 "single": lambda: InversePlanner(
-                    lambda s: self.landing(s)[:1], self.config.inverse, stored=self.data["stretches"]
+                    FrozenLanding(self.net.member(0)), self.config.inverse, stored=self.data["stretches"]
                 ),
                 "ensemble": lambda: self.inverse,
                 "tandem": self._tandem,
@@ -164,8 +163,3 @@ class Fitted:
 def mean_landing(landing: FrozenLanding, stretches: np.ndarray) -> np.ndarray:
     """The ensemble's landing of stretches (n, n_actuators), shape (n, 2) [m]."""
     return landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy().astype(np.float64)
-
-
-def save_net(net: HopNet, path: Path, data: HopData, seconds: float) -> None:
-    """Checkpoint of the surrogate and its card."""
-    model.save(net, path, {"hops": len(data), "configuration": data.configuration, "seconds": seconds})

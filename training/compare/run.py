@@ -21,7 +21,7 @@ from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.hops import Hops
-from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, model_of, save_net, simulated
+from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, model_of, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.planner import BestOfPlanner, NearestHopPlanner, Planner
 from training.policies import ActorPolicy
@@ -159,9 +159,9 @@ class Comparison:
         data = self.learnt(seed, budget)
 
         def learn() -> Results:
-            net, seconds = fit_net(data, config, seed)
-            save_net(net, path, data, seconds)
-            return {"seconds": seconds}
+            net, card = fit_net(data, config, seed)
+            model.save(net, path, card)
+            return {"seconds": card["seconds"]}
 
         settings = {"surrogate": asdict(config.surrogate), "updates": config.updates}
         self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{tag}"], files=[path.name])

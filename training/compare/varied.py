@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -167,8 +168,12 @@ class VariedFitted:
 
     @one_thread()
     def _of_one_net(self, values: Floats) -> InversePlanner:
-        landing = self.landing.at(values)
-        return InversePlanner(lambda s: landing(s)[:1], self.config.inverse)
+        return InversePlanner(self._first.at(values), self.config.inverse)
+
+    @cached_property
+    def _first(self) -> FrozenLanding:
+        """The first member alone."""
+        return FrozenLanding(self.net.member(0), self.scenes.observed)
 
     def _tandem(self) -> Planner:
         low, high = (torch.from_numpy(bound.astype(np.float32)) for bound in self.scenes.bounds())
