@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from surrogate import dataset, generate
 from surrogate.chunks import Task, run_chunk
 from surrogate.dataset import Configuration, HopData
 from tensegrity_gym import ENERGY_NAMES, HopResult, Scene, form_find, simulate
+from tensegrity_gym.specimen import moved_start
 
 CHUNKS = 60
 #: Where single precision is compared with double: hops of a flight.
@@ -29,12 +29,9 @@ def rounding(hops: int = 16) -> None:
     stretches = rng.uniform(0.2, 0.8, (hops, 4))
     for name, scene in SCENES.items():
         start = form_find(stretches, scene=scene)
-        shift = rng.normal(size=start.positions.shape)
-        shift *= 1e-5 / np.linalg.norm(shift, axis=2, keepdims=True)
-        shift[:, :, 2] = np.maximum(shift[:, :, 2], -start.positions[:, :, 2])  # nothing starts below the ground
         double = simulate(stretches, scene=scene, equilibria=start)
         single = simulate(stretches, scene=scene, equilibria=start, precision="float32")
-        moved = simulate(stretches, scene=scene, equilibria=replace(start, positions=start.positions + shift))
+        moved = simulate(stretches, scene=scene, equilibria=moved_start(start))
         apart = [1e3 * np.median(np.linalg.norm(r.touchdown - double.touchdown, axis=1)) for r in (single, moved)]
         drift, damped = (v.mean(axis=1) / single.stored_energy for v in _drift(single, double))
         print(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,9 @@ from surrogate.outputs import OUTPUTS
 from tensegrity_gym import STRETCH_RANGE, Design, HopResult, Lattice, Scene, form_find, simulate
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.fidelity import Fidelity
+from tensegrity_gym.specimen import POSITION, moved_start
 from tensegrity_gym.types import Floats
 
-#: How far each node of the start is moved [m]; less than any builder can tell.
-PERTURBATION = 1e-5
 #: Distances of neighbours along a line in the stretches [-]; 10 000 hops lie about 0.06 apart.
 STEPS = (1e-3, 1e-2, 6e-2)
 
@@ -35,12 +33,9 @@ def measure_floor(data: HopData, hops: int) -> dict[str, dict[str, float]]:
     rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
     random = np.random.default_rng(0)
     start = form_find(data["stretches"][rows], design=fidelity.design(design), **settings)
-    shift = random.normal(size=start.positions.shape)
-    shift *= PERTURBATION / np.linalg.norm(shift, axis=2, keepdims=True)
-    shift[:, :, 2] = np.where(start.positions[:, :, 2] + shift[:, :, 2] < 0, 0.0, shift[:, :, 2])
     reference = outputs_of(simulate(start.stretches, equilibria=start, **how))
-    moved = replace(start, positions=start.positions + shift)
-    apart = {f"start moved by {PERTURBATION:g} m": outputs_of(simulate(start.stretches, equilibria=moved, **how)) - reference}
+    moved = outputs_of(simulate(start.stretches, equilibria=moved_start(start), **how))
+    apart = {f"start moved by {POSITION:g} m": moved - reference}
     middle = sum(STRETCH_RANGE) / 2
     for step in STEPS:
         direction = np.abs(random.normal(size=start.stretches.shape)) * np.sign(middle - start.stretches)  # inwards: in range

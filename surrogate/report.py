@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +19,7 @@ from tensegrity_gym import ENERGY_NAMES, Design, HopStatus, Lattice, Scene, form
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.events import flew
 from tensegrity_gym.fidelity import Fidelity
+from tensegrity_gym.specimen import moved_start
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -27,8 +28,6 @@ th, td { padding: .35em .8em; border-bottom: 1px solid #ddd; text-align: left; v
 img { max-width: 100%; height: auto; border: 1px solid #eee; }
 figure { margin: 2em 0; } figcaption { color: #555; font-size: 14px; }
 """
-#: How far the start of a hop is moved to see how far its landing moves [m]; less than any builder can tell.
-PERTURBATION = 1e-5
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def findings(data: HopData) -> dict[str, str]:
 
 
 def measured_floor(data: HopData, hops: int) -> dict[str, str]:
-    """How far landings move when the start of a hop is moved by 10 um: nothing predicts them better than that."""
+    """How far landings move when the masses of a start are moved (`moved_start`): nothing predicts them better than that."""
     from surrogate import figures
 
     c = data.configuration
@@ -109,12 +108,8 @@ def measured_floor(data: HopData, hops: int) -> dict[str, str]:
     design, fidelity = Design(**c["design"]), Fidelity(**c.get("fidelity", {"precision": c["precision"]}))
     rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
     start = form_find(data["stretches"][rows], design=fidelity.design(design), **settings)
-    shift = np.random.default_rng(0).normal(size=start.positions.shape)
-    shift *= PERTURBATION / np.linalg.norm(shift, axis=2, keepdims=True)
-    shift[:, :, 2] = np.where(start.positions[:, :, 2] + shift[:, :, 2] < 0, 0.0, shift[:, :, 2])
-    moved = replace(start, positions=start.positions + shift)
     how = {"dt": c["dt"], "design": design, "fidelity": fidelity, **settings}
-    pair = [simulate(start.stretches, equilibria=e, **how) for e in (start, moved)]
+    pair = [simulate(start.stretches, equilibria=e, **how) for e in (start, moved_start(start))]
     said = {}
     for name in reversed(figures.places(data.rows(rows))):
         apart = 1e3 * np.linalg.norm(getattr(pair[0], name) - getattr(pair[1], name), axis=1)

@@ -1,14 +1,26 @@
-"""A lattice as it would be built: no two members quite alike."""
+"""A lattice as it would be built and set up: no two members quite alike, no mass quite where it should be."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tensegrity_gym.design import Design
+from tensegrity_gym.formfinding import Equilibria
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.types import Structure
+
+#: Standard deviation of a coordinate that nobody can know [m].
+POSITION = 1e-5
+#: Masses lower than this lie on the ground, and stay there [m].
+LYING = 1e-3
+
+
+def moved_start(found: Equilibria, seed: int = 0, size: float = POSITION) -> Equilibria:
+    """The equilibria with each coordinate of the masses above the ground moved by a normal ``size`` [m]."""
+    noise = np.random.default_rng(seed).normal(0.0, size, found.positions.shape)
+    return replace(found, positions=found.positions + noise * (found.positions[:, :, 2:] > LYING))
 
 
 @dataclass(frozen=True)
