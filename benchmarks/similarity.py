@@ -17,8 +17,8 @@ from surrogate.frozen import FrozenLanding
 from surrogate.model import NetConfig
 from surrogate.train import TrainConfig, train
 from tensegrity_gym.task import reach
-from training.compare.hops import VariedHops
 from training.compare.targets import scenes_of
+from training.hops import VariedHops
 from training.similarity import alike_data, likeness
 from training.varied import scene_values
 

@@ -23,9 +23,9 @@ from tensegrity_gym.task import reach, reachable
 from training.compare import report, run
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
-from training.compare.hops import PERTURBATION, Hops, VariedHops, repeated
 from training.compare.results import Outcome
 from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
+from training.hops import PERTURBATION, Hops, VariedHops, repeated
 from training.inverse import InversePlanner
 
 QUICK = Scene(duration=0.05)

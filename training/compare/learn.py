@@ -26,8 +26,8 @@ from tensegrity_gym.errors import DataFileError
 from tensegrity_gym.fidelity import FIDELITIES, Fidelity, named_fidelity
 from tensegrity_gym.scene_ranges import SceneRanges
 from training.compare.config import CompareConfig
-from training.compare.hops import Hops
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.hops import Hops
 from training.inverse import InversePlanner, fit_energy
 from training.planner import NearestHopPlanner, Planner
 from training.tandem import TandemPlanner

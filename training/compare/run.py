@@ -20,9 +20,9 @@ from tensegrity_gym.task import check_fidelity, reach
 from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
-from training.compare.hops import Hops
 from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, model_of, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.hops import Hops
 from training.planner import BestOfPlanner, NearestHopPlanner, Planner
 from training.policies import ActorPolicy
 from training.refine import RefiningPlanner

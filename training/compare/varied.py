@@ -20,9 +20,9 @@ from surrogate.model import HopNet, one_thread
 from tensegrity_gym.task import check_fidelity, reach
 from tensegrity_gym.types import Floats
 from training.compare.config import CompareConfig
-from training.compare.hops import VariedHops
 from training.compare.run import BLOCK, FLOOR_HOPS, Comparison
 from training.evolution import EvolutionConfig
+from training.hops import VariedHops
 from training.inverse import InversePlanner, fit_energy
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner

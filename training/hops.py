@@ -1,4 +1,4 @@
-"""The simulator as the comparison sees it: where do stretches land, and where if the start is moved a little?"""
+"""The simulator as planners and scores see it: where do stretches land, and where if the start is moved a little?"""
 
 from __future__ import annotations
 
