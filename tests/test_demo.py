@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from surrogate import dataset
 from surrogate.model import NetConfig
 from surrogate.train import TrainConfig
+from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, OutputFolderError
-from training import demo
+from tensegrity_gym.task import reach
+from training import demo, report
 from training.demo import DemoConfig
+from training.hops import Hops
 from training.inverse import InverseConfig
+from training.score import Score, distances
 
 SMALL = DemoConfig(
     hops=16,
@@ -43,7 +50,7 @@ def test_whole_chain_leaves_data_models_pictures_and_a_closed_report(folder: Pat
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == len(PICTURES)
     assert not re.search(r"(src|href)=\"(?!data:)", page)  # nothing is fetched from elsewhere
-    for text in (*demo.METHODS.values(), "of reach", "of the stored energy"):
+    for text in (*demo.METHODS.values(), "of reach", "of the stored energy", "from 8 starts", "Floor: "):
         assert text in page
     assert not list(folder.glob("**/*.partial"))
 
@@ -67,6 +74,53 @@ def test_errors_of_every_method_are_counted_in_metres_and_reaches(folder: Path) 
     assert [row["simulator_calls"] for row in rows] == [16, 16, 16 + 8 * 4, 16]
     for row in rows:
         assert row["median_percent"] / row["median_error"] == pytest.approx(row["mean_percent"] / row["mean_error"])
+
+
+def test_no_answer_is_scored_on_the_hop_that_chose_it(folder: Path) -> None:
+    """Each is scored from eight moved starts, of which none repeats the unmoved hop: neither the stored nor the tried one."""
+    found = demo.run(replace(SMALL, out=folder)).results["evaluation"]
+    data, targets = dataset.read(folder / "data.h5"), dataset.read(folder / "targets.h5")
+    unmoved = Hops(Scene.preset("earth", landing="touchdown"), {"fidelity": "flown"})
+    for method in demo.METHODS:
+        score = Score.from_dict(found[method]["16"])
+        assert score.landings.shape == (4, 8, 2)
+        assert len(np.unique(score.landings.reshape(-1, 2), axis=0)) == len(np.unique(score.stretches, axis=0)) * 8
+        alike = np.linalg.norm(score.landings - unmoved.land(score.stretches)[:, None], axis=2)
+        assert (alike > 0).all()
+        assert np.median(alike) < 2e-3  # moved by little all the same
+        wanted = np.linalg.norm(score.landings - targets["landing"][:, None], axis=2).mean(axis=1)
+        np.testing.assert_allclose(score.errors, wanted)
+    nearest = Score.from_dict(found["nearest"]["16"])
+    rows = [int(np.flatnonzero((data["stretches"] == asked).all(axis=1))[0]) for asked in nearest.stretches]
+    assert (np.linalg.norm(nearest.landings - data["landing"][rows][:, None], axis=2) > 0).all()
+    assert len(found["floor"]) == 4
+    assert 0 < min(found["floor"]) <= max(found["floor"]) < 2e-3
+
+
+def test_a_failed_hop_counts_as_two_reaches() -> None:
+    landings = np.array([[(0.0, 3.0), (np.nan, np.nan)], [(4.0, 0.0), (0.0, 0.0)]])
+    np.testing.assert_allclose(distances(landings, np.zeros((2, 2)), 5.0), [[3, 10], [4, 0]])
+    score = Score(np.zeros((2, 4)), landings, np.array([6.5, 2.0]))
+    assert score.summary(5.0)["failed_percent"] == 25
+    assert Score.from_dict(score.as_dict()).summary(5.0) == score.summary(5.0)
+
+
+def test_floor_is_told_below_the_table(folder: Path) -> None:
+    run = demo.run(replace(SMALL, out=folder))
+    told = run.results["report"]
+    floor = np.median(run.results["evaluation"]["floor"])
+    assert f"by {1e3 * floor:.2g} mm" in told["caption"]
+    assert report.text_table(told["rows"], told["caption"]).splitlines()[-1] == told["caption"]
+    assert told["caption"].replace("'", "&#x27;") in (folder / "report.html").read_text(encoding="utf-8")
+    assert reach(Scene.preset("earth", landing="touchdown")) > 10 * floor
+
+
+def test_another_scoring_scores_anew_and_keeps_the_rest(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(folder, tmp_path / "demo")
+    monkeypatch.setattr(demo, "STARTS", 2)
+    again = demo.run(replace(SMALL, out=tmp_path / "demo"))
+    assert set(again.results) - set(again.skipped) == {"evaluation", "report"}
+    assert np.shape(again.results["evaluation"]["policy"]["16"]["landings"]) == (4, 2, 2)
 
 
 def test_another_seed_in_the_same_folder_is_refused(folder: Path) -> None:

@@ -87,6 +87,7 @@ def test_moved_starts_are_moved_by_what_is_said_and_the_first_not_at_all() -> No
     assert landings.shape == (2, 4, 2)
     assert hops.calls == 8
     np.testing.assert_array_equal(landings[:, 0], simulate(stretches, scene=QUICK).landing)
+    np.testing.assert_array_equal(landings[:, 1:], hops.moved(stretches, 3))
     moved = np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2)
     assert (moved > 0).all()
     assert (moved < 100 * PERTURBATION).all()

@@ -116,15 +116,17 @@ def predicted_against_simulated(predicted: np.ndarray, held_out: HopData, path: 
 
 
 def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
-    """Targets and simulated landings of each method's answers, joined by lines."""
+    """Targets and where each method's answers landed from their moved starts, joined by lines."""
     with _style():
         figure, axes = plt.subplots(
             1, len(scores), figsize=(4 * len(scores), 4.2), layout="constrained", sharex=True, sharey=True
         )
         for k, (ax, (label, found)) in enumerate(zip(np.atleast_1d(axes), scores.items(), strict=True)):
-            ax.plot(*np.stack([targets, found.landings]).transpose(2, 0, 1), color="#999999", lw=0.9)
+            meant = np.repeat(targets, found.starts, axis=0)
+            landed = found.landings.reshape(-1, 2)
+            ax.plot(*np.stack([meant, landed]).transpose(2, 0, 1), color="#999999", lw=0.4)
             ax.plot(*targets.T, "o", mfc="none", mec="black", ms=6, label="target")
-            ax.plot(*found.landings.T, ".", color=COLOURS[k], ms=8, label="landing")
+            ax.plot(*landed.T, ".", color=COLOURS[k], ms=4, label="landings from moved starts")
             ax.set(title=f"{label}\nmedian error {1e3 * np.median(found.errors):.2g} mm", xlabel="x [m]", aspect="equal")
             ax.title.set_fontsize(11)
         np.atleast_1d(axes)[0].set(ylabel="y [m]")
@@ -132,8 +134,8 @@ def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
         return save(figure, path)
 
 
-def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float, path: Path) -> Path:
-    """Landing error of each method against the simulator calls that it learnt from."""
+def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float, floor: float, path: Path) -> Path:
+    """Landing error of each method against the simulator calls that it learnt from, above the ``floor`` [m]."""
 
     def percent(metre: Any) -> Any:
         return 100 * metre / reach
@@ -148,6 +150,7 @@ def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float,
             low, middle, high = np.array([np.quantile(by_calls[c].errors, (0.25, 0.5, 0.75)) for c in calls]).T
             axes.plot(calls, middle, "o-", color=COLOURS[k], label=label)
             axes.fill_between(calls, np.maximum(low, 1e-6), high, color=COLOURS[k], alpha=0.13, lw=0)
+        axes.axhline(floor, color="#888888", ls=":", label="floor: start moved by 10 µm")
         axes.set(xscale="log", yscale="log", xlabel="simulator calls learnt from", ylabel="landing error [m]")
         axes.set_xticks(calls, [str(c) for c in calls])
         axes.minorticks_off()

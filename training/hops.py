@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from tensegrity_gym import Equilibria, HopResult, Scene, simulate
+from tensegrity_gym import Design, Equilibria, HopResult, Scene, form_find, simulate
 from tensegrity_gym.batch import thread_count
+from tensegrity_gym.fidelity import named_fidelity
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
 
@@ -40,14 +41,20 @@ class Hops:
     def perturbed(self, stretches: Floats, times: int, asked: Floats | None = None) -> Floats:
         """Landings of the hops and of each ``times`` over from a moved start, shape (n, 1 + times, 2) [m]."""
         nominal = self.simulate(stretches)
-        n, found = len(stretches), nominal.equilibria
-        assert found is not None, "hops start from equilibria"
-        moved = repeated(found, times)
+        assert nominal.equilibria is not None, "hops start from equilibria"
+        return np.concatenate([_landings(nominal)[:, None], self._from_moved(nominal.equilibria, times)], axis=1)
+
+    def moved(self, stretches: Floats, times: int) -> Floats:
+        """Landings of each hop ``times`` over from a moved start alone, shape (n, times, 2) [m]; not for fidelity "auto"."""
+        modelled = named_fidelity(self.levers.get("fidelity", "paper")).design(Design())
+        return self._from_moved(form_find(stretches, design=modelled, scene=self.scene, threads=self.threads), times)
+
+    def _from_moved(self, found: Equilibria, times: int) -> Floats:
+        n, moved = len(found.stretches), repeated(found, times)
         noise = np.random.default_rng(SEED).normal(0, PERTURBATION, (times, *found.positions.shape[1:]))
         above = moved.positions[:, :, 2:] > 1e-3
         moved = replace(moved, positions=moved.positions + np.tile(noise, (n, 1, 1)) * above)
-        others = _landings(self.simulate(np.repeat(stretches, times, axis=0), moved))
-        return np.concatenate([_landings(nominal)[:, None], others.reshape(n, times, 2)], axis=1)
+        return _landings(self.simulate(moved.stretches, moved)).reshape(n, times, 2)
 
 
 class VariedHops:

@@ -8,12 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from surrogate.storage import atomic_path
+from training.hops import PERTURBATION
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("method", "method", "s"),
-    ("median_error", "median error [m]", ".4f"),
-    ("mean_error", "mean error [m]", ".4f"),
+    ("median_error", "median error [m]", ".2g"),
+    ("mean_error", "mean error [m]", ".2g"),
     ("median_percent", "median [% of reach]", ".1f"),
     ("mean_percent", "mean [% of reach]", ".1f"),
     ("failed_percent", "failed [%]", ".0f"),
@@ -32,15 +35,24 @@ figure { margin: 2em 0; } figcaption { color: #555; font-size: 14px; }
 """
 
 
-def text_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of :func:`training.demo.table_rows` aligned for a terminal."""
+def scored(floor: np.ndarray, starts: int) -> str:
+    """How errors were measured, and the floor under them; ``floor``: of each target's own hop, shape (n,) [m]."""
+    median, mean = 1e3 * float(np.median(floor)), 1e3 * float(floor.mean())
+    return (
+        f"Errors: mean distance to the target from {starts} starts, each mass moved by {1e6 * PERTURBATION:g} µm. "
+        f"Floor: such moves alone carry the landings of the targets' own hops by {median:.2g} mm (mean {mean:.2g} mm)."
+    )
+
+
+def text_table(rows: Sequence[dict[str, Any]], caption: str) -> str:
+    """Rows of :func:`training.demo.table_rows` aligned for a terminal, and a caption below."""
     cells = [[title for _, title, _ in COLUMNS]] + [[format(row[key], form) for key, _, form in COLUMNS] for row in rows]
     widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
     lines = [
         "  ".join(c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True)))
         for line in cells
     ]
-    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:], caption])
 
 
 def _html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -58,12 +70,13 @@ def _figure(path: Path, caption: str) -> str:
 def write(
     path: Path,
     rows: Sequence[dict[str, Any]],
+    caption: str,
     facts: dict[str, Any],
     closures: dict[str, float],
     stretches: Sequence[float],
     seconds: dict[str, float],
 ) -> Path:
-    """Write the page; its pictures are read from the same folder and put into it."""
+    """Write the page, ``caption`` below its table; its pictures are read from the same folder and put into it."""
     shown = ", ".join(f"{s:g}" for s in stretches)
     captions = {
         "hop.png": f"The hop of stretches ({shown}), as simulated.",
@@ -71,21 +84,24 @@ def write(
         f"over all stored hops, between release, take-off, touchdown and end, to {closures['data']:.2g} %.",
         "landing_map.png": "Where the stored hops came to rest and where they first touched down, coloured by λ1 − λ2 + λ3 − λ4.",
         "scatter.png": "The surrogate's predictions against simulation, on held-out hops that it never saw.",
-        "plans.png": "Targets (circles), and where the answers of each method landed when simulated.",
+        "plans.png": "Targets (circles), and where the answers of each method landed from each of their moved starts.",
         "error_calls.png": "Landing error against the simulator calls that a method learnt from: median over the held-out "
-        "targets, band from the first to the third quartile. One training seed: differences within the bands mean little.",
+        "targets, band from the first to the third quartile. Dotted: the floor, how far a start moved by 10 µm alone carries a "
+        "landing. One training seed: differences within the bands mean little.",
     }
     table = _html_table([t for _, t, _ in COLUMNS], [[format(row[key], form) for key, _, form in COLUMNS] for row in rows])
     note = (
         "Wall time is all a method needs before its last answer: simulating its hops, training, answering. Per answer: a "
-        "batch's time over its targets. Targets are landings of other simulated hops, which no method learnt from. A stored "
-        "hop repeats bit by bit in simulation, where nothing scatters its start: that flatters the nearest stored hop "
-        "wherever landings are chaotic. Hops in turn are simulated for each answer, and counted; touchdowns by a "
-        "cheaper model, which flies rigidly and ends there. All answers are scored on the paper's model."
+        "batch's time over its targets. Targets are landings of other simulated hops, which no method learnt from. Hops in "
+        "turn are simulated for each answer, from the unmoved start, and counted; touchdowns by a cheaper model, which flies "
+        "rigidly and ends there. No answer is scored on the hop that chose it: a hop repeated from the same start lands in the "
+        "same place bit by bit, however chaotic. All methods see the same moved starts; a failed hop counts as landing two "
+        "reaches away. Scoring is by the paper's model in single precision, with rigid flight where touchdowns are read, and "
+        "its hops count for no method."
     )
     page = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tensegrity hop demo</title><style>{STYLE}</style>',
-        f"<h1>From four stretches to a planned landing</h1>{table}<p>{note}</p>",
+        f"<h1>From four stretches to a planned landing</h1>{table}<p>{html.escape(caption)}</p><p>{note}</p>",
         *(_figure(path.parent / name, caption) for name, caption in captions.items()),
         "<h2>What was run</h2>",
         _html_table(["setting", "value"], [[str(k), str(v)] for k, v in facts.items()]),

@@ -1,4 +1,4 @@
-"""Simulate what a planner or policy proposes and measure where it lands."""
+"""Simulate what a planner or policy proposes, from starts moved a little, and measure how far from its targets it lands."""
 
 from __future__ import annotations
 
@@ -7,50 +7,40 @@ from typing import Any
 
 import numpy as np
 
-from tensegrity_gym import Design, HopStatus, Lattice, Scene, simulate
-from training.planner import Planner
+from tensegrity_gym.task import TARGET_LIMIT, reach
+from tensegrity_gym.types import Floats
+from training.hops import Hops
 
-FIELDS = ("stretches", "landings", "errors", "failed")
+FIELDS = ("stretches", "landings", "errors")
 
 
 @dataclass(frozen=True)
 class Score:
-    """Landing errors of one planner on a set of targets."""
+    """Landing errors of one method's answers on a set of targets, each answer simulated from ``starts`` moved starts."""
 
     stretches: np.ndarray  #: proposed, shape (n, n_actuators) [-]
-    landings: np.ndarray  #: simulated, shape (n, 2) [m]
-    errors: np.ndarray  #: distance to the targets, shape (n,) [m]
-    failed: np.ndarray  #: hops that blew up or had no equilibrium, shape (n,)
+    landings: np.ndarray  #: simulated, shape (n, starts, 2) [m]; not-a-number where a hop failed
+    errors: np.ndarray  #: mean distance of an answer's landings to its target, shape (n,) [m]
+
+    @property
+    def starts(self) -> int:
+        """Moved starts of each answer."""
+        return self.landings.shape[1]
 
     def summary(self, reach: float) -> dict[str, float]:
-        """Median and mean error [m] and in % of ``reach`` [m], and the share of failed hops [%].
-
-        A failed hop counts as landing where it last was finite; the share says how many there are.
-        """
+        """Median and mean error [m] and in % of ``reach`` [m], and the share of failed hops [%]."""
         median, mean = float(np.median(self.errors)), float(self.errors.mean())
         return {
             "median_error": median,
             "mean_error": mean,
             "median_percent": 100 * median / reach,
             "mean_percent": 100 * mean / reach,
-            "failed_percent": 100 * float(self.failed.mean()),
+            "failed_percent": 100 * float((~np.isfinite(self.landings).all(axis=2)).mean()),
         }
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-like content."""
         return {name: getattr(self, name).tolist() for name in FIELDS}
-
-    def divided(self, parts: int) -> list[Score]:
-        """Equal parts, in order."""
-        columns = [np.split(getattr(self, name), parts) for name in FIELDS]
-        return [Score(*part) for part in zip(*columns, strict=True)]
-
-    @classmethod
-    def of_landings(cls, stretches: Any, landings: Any, targets: np.ndarray) -> Score:
-        """Score of hops that are known to have landed at ``landings`` (n, 2) [m]."""
-        landings = np.asarray(landings, dtype=np.float64)
-        errors = np.linalg.norm(landings - targets, axis=1)
-        return cls(np.asarray(stretches, dtype=np.float64), landings, errors, np.zeros(len(landings), dtype=bool))
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> Score:
@@ -58,31 +48,27 @@ class Score:
         return cls(*(np.array(content[name]) for name in FIELDS))
 
 
-def score(
-    planner: Planner,
-    targets: np.ndarray,
-    scene: Scene,
-    *,
-    design: Design | None = None,
-    lattice: Lattice | None = None,
-    progress: Any = None,
-) -> Score:
-    """Ask ``planner`` for every target (n, 2) [m] and simulate its answers; these hops count as evaluation."""
-    stretches, _ = planner.predict(np.asarray(targets, dtype=np.float32), deterministic=True)
-    return score_stretches(stretches, targets, scene, design=design, lattice=lattice, progress=progress)
+def score_stretches(stretches: Floats, targets: Floats, hops: Hops, starts: int) -> Score:
+    """Simulate stretches (n, n_actuators), meant to land on ``targets`` (n, 2) [m], each from ``starts`` moved starts.
 
-
-def score_stretches(
-    stretches: np.ndarray,
-    targets: np.ndarray,
-    scene: Scene,
-    *,
-    design: Design | None = None,
-    lattice: Lattice | None = None,
-    progress: Any = None,
-) -> Score:
-    """Simulate stretches (n, n_actuators) that are meant to land on ``targets`` (n, 2) [m]."""
+    The unmoved start is left out: a planner may have tried its answer there, and a stored hop repeats its landing bit by bit.
+    """
     stretches = np.asarray(stretches, dtype=np.float64)
-    result = simulate(stretches, design=design or Design(), scene=scene, lattice=lattice or Lattice(), progress=progress)
-    errors = np.linalg.norm(result.landing - np.asarray(targets, dtype=np.float64), axis=1)
-    return Score(stretches, result.landing, errors, np.isin(result.status, (HopStatus.UNSTABLE, HopStatus.NOT_CONVERGED)))
+    landings = hops.moved(stretches, starts)
+    return Score(stretches, landings, distances(landings, targets, reach(hops.scene)).mean(axis=1))
+
+
+def scatter(stretches: Floats, hops: Hops, starts: int) -> Floats:
+    """How far moved starts alone carry the landings of ``stretches``: mean distance from the unmoved hop's, shape (n,) [m]."""
+    landings = hops.perturbed(stretches, starts)
+    return distances(landings[:, 1:], landings[:, 0], reach(hops.scene)).mean(axis=1)
+
+
+def distances(landings: Floats, targets: Floats, reaches: Floats | float) -> Floats:
+    """Distances of landings (..., n, starts, 2) from targets (n, 2), shape (..., n, starts) [m].
+
+    A failed hop counts as one that landed as far away as any target may be; ``reaches``: of the targets' scenes, (n, 1) or
+    one [m].
+    """
+    found = np.linalg.norm(landings - np.asarray(targets, dtype=np.float64)[:, None], axis=-1)
+    return np.where(np.isfinite(found), found, TARGET_LIMIT * reaches)

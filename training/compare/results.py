@@ -8,10 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_LIMIT, TARGET_PLACES
+from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_PLACES
 from tensegrity_gym.types import Floats
 from training.compare.run import SIMULATING, Comparison
 from training.compare.statistics import interquartile_mean, interval, probability_of_improvement
+from training.score import distances
 
 LABELS = {
     "nearest": "nearest stored hop",
@@ -116,8 +117,8 @@ class Outcome:
         A failed hop counts as one that landed as far away as any target may be.
         """
         rows = self.rows[place]
-        error = np.linalg.norm(self._landings(method, budget, place) - self.comparison.targets[rows, None, :2], axis=3)
-        return np.where(np.isfinite(error), error, TARGET_LIMIT * self.reaches[rows, None]) / self.unit[rows, None]
+        landings, targets = self._landings(method, budget, place), self.comparison.targets[rows, :2]
+        return distances(landings, targets, self.reaches[rows, None]) / self.unit[rows, None]
 
     def _landings(self, method: str, budget: int, place: str) -> Floats:
         """From moved starts, shape (seeds, targets, perturbations, 2) [m]."""
