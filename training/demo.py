@@ -275,12 +275,12 @@ def _report(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, hel
             "failed hops": f"{results['data']['failed']} of {len(data)}",
             "physics version": MODEL_VERSION,
             "answers scored by": f"fidelity {SCORED_BY[config.landing]}, starts moved by {1e6 * PERTURBATION:g} µm",
-            "moved starts by simulator calls": ", ".join(f"{b}: {s.starts}" for b, s in scores["planner"].items()),
             "packages": ", ".join(f"{k} {v}" for k, v in package_versions().items()),
         }
         closures = {"shown": results["hop"]["closure_percent"], "data": results["data"]["closure_percent"]}
         caption = report.scored(floor, STARTS)
-        report.write(folder / "report.html", rows, caption, facts, closures, SHOWN_HOP, dict(stages.seconds))
+        starts = ", ".join(f"{s.starts} at {b}" for b, s in scores["planner"].items())
+        report.write(folder / "report.html", rows, caption, facts, closures, starts, SHOWN_HOP, dict(stages.seconds))
         return {"rows": rows, "caption": caption}
 
     pictures = ["landing_map.png", "scatter.png", "plans.png", "error_calls.png", "report.html"]

@@ -130,7 +130,7 @@ def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
             ax.set(title=f"{label}\nmedian error {1e3 * np.median(found.errors):.2g} mm", xlabel="x [m]", aspect="equal")
             ax.title.set_fontsize(11)
         np.atleast_1d(axes)[0].set(ylabel="y [m]")
-        np.atleast_1d(axes)[0].legend(loc="best", fontsize=9)
+        np.atleast_1d(axes)[0].legend(loc="upper left", bbox_to_anchor=(0, 0), borderaxespad=4.5, fontsize=9)
         return save(figure, path)
 
 
@@ -144,7 +144,7 @@ def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float,
         return percentage * reach / 100
 
     with _style():
-        figure, axes = plt.subplots(figsize=(7.5, 4.8), layout="constrained")
+        figure, axes = plt.subplots(figsize=(7.5, 5.4), layout="constrained")
         for k, (label, by_calls) in enumerate(scores.items()):
             calls = np.array(sorted(by_calls))
             low, middle, high = np.array([np.quantile(by_calls[c].errors, (0.25, 0.5, 0.75)) for c in calls]).T
@@ -159,5 +159,5 @@ def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float,
         for axis in (axes.yaxis, right.yaxis):
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("")
-        axes.legend(loc="lower left")
+        figure.legend(loc="outside lower center", ncols=2)
         return save(figure, path)

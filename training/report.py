@@ -39,7 +39,7 @@ def scored(floor: np.ndarray, starts: int) -> str:
     """How errors were measured, and the floor under them; ``floor``: of each target's own hop, shape (n,) [m]."""
     median, mean = 1e3 * float(np.median(floor)), 1e3 * float(floor.mean())
     return (
-        f"Errors: mean distance to the target from {starts} starts, each mass moved by {1e6 * PERTURBATION:g} µm. "
+        f"Errors: mean distance to the target from {starts} starts, masses above the ground moved by {1e6 * PERTURBATION:g} µm. "
         f"Floor: such moves alone carry the landings of the targets' own hops by {median:.2g} mm (mean {mean:.2g} mm)."
     )
 
@@ -73,6 +73,7 @@ def write(
     caption: str,
     facts: dict[str, Any],
     closures: dict[str, float],
+    starts: str,
     stretches: Sequence[float],
     seconds: dict[str, float],
 ) -> Path:
@@ -87,7 +88,7 @@ def write(
         "plans.png": "Targets (circles), and where the answers of each method landed from each of their moved starts.",
         "error_calls.png": "Landing error against the simulator calls that a method learnt from: median over the held-out "
         "targets, band from the first to the third quartile. Dotted: the floor, how far a start moved by 10 µm alone carries a "
-        "landing. One training seed: differences within the bands mean little.",
+        f"landing. Moved starts of an answer: {starts} calls. One training seed: differences within the bands mean little.",
     }
     table = _html_table([t for _, t, _ in COLUMNS], [[format(row[key], form) for key, _, form in COLUMNS] for row in rows])
     note = (
