@@ -127,7 +127,8 @@ def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
             ax.plot(*np.stack([meant, landed]).transpose(2, 0, 1), color="#999999", lw=0.4)
             ax.plot(*targets.T, "o", mfc="none", mec="black", ms=6, label="target")
             ax.plot(*landed.T, ".", color=COLOURS[k], ms=4, label="landings from moved starts")
-            ax.set(title=f"{label}\nmedian error {1e3 * np.median(found.errors):.2g} mm", xlabel="x [m]", aspect="equal")
+            median = float(f"{1e3 * np.median(found.errors):.2g}")  # two digits, and no exponent where they are metres
+            ax.set(title=f"{label}\nmedian error {median:g} mm", xlabel="x [m]", aspect="equal")
             ax.title.set_fontsize(11)
         np.atleast_1d(axes)[0].set(ylabel="y [m]")
         np.atleast_1d(axes)[0].legend(loc="upper left", bbox_to_anchor=(0, 0), borderaxespad=4.5, fontsize=9)
