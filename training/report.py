@@ -88,7 +88,7 @@ def write(
         "plans.png": "Targets (circles), and where the answers of each method landed from each of their moved starts.",
         "error_calls.png": "Landing error against the simulator calls that a method learnt from: median over the held-out "
         "targets, band from the first to the third quartile. Dotted: the floor, how far a start moved by 10 µm alone carries a "
-        f"landing. Moved starts of an answer: {starts} calls. One training seed: differences within the bands mean little.",
+        f"landing. Moved starts of an answer: {starts}. One training seed: differences within the bands mean little.",
     }
     table = _html_table([t for _, t, _ in COLUMNS], [[format(row[key], form) for key, _, form in COLUMNS] for row in rows])
     note = (
