@@ -279,11 +279,9 @@ def _report(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, hel
         }
         closures = {"shown": results["hop"]["closure_percent"], "data": results["data"]["closure_percent"]}
         caption = report.scored(floor, STARTS)
-        starts = str(STARTS)
-        if STARTS_BELOW[config.landing] < STARTS:
-            starts += (
-                f", below {config.hops} calls {STARTS_BELOW[config.landing]}, from which medians come out a tenth lower or so"
-            )
+        starts, below = str(STARTS), STARTS_BELOW[config.landing]
+        if below < STARTS:
+            starts += f", below {config.hops} calls {below}, from which medians come out a tenth lower or so"
         report.write(folder / "report.html", rows, caption, facts, closures, starts, SHOWN_HOP, dict(stages.seconds))
         return {"rows": rows, "caption": caption}
 
