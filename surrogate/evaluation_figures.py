@@ -140,8 +140,8 @@ def nets(cells: dict[str, Any]) -> Figure:
             for c, x, y in zip(chosen, rate, error, strict=True):
                 axis.annotate(str(c["hidden"][0]), (x, y), textcoords="offset points", xytext=(4, 4), fontsize=8)
         axis.axvline(1e6, color="0.5", lw=1, ls=":")
-        for each, form in ((axis.xaxis, EngFormatter()), (axis.yaxis, FormatStrFormatter("%g"))):
-            each.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+        for each, form, ticks in ((axis.xaxis, EngFormatter(), (1, 2, 5)), (axis.yaxis, FormatStrFormatter("%g"), range(1, 10))):
+            each.set_major_locator(LogLocator(subs=tuple(ticks)))
             each.set_major_formatter(form)
             each.set_minor_formatter(NullFormatter())
         axis.set(xlabel="landings of one member in a second of one core", ylabel="rms error of test hops [mm]", title=name)
