@@ -73,7 +73,11 @@ def test_probability_of_improvement_and_profile() -> None:
 
 
 def test_registered_targets_are_what_their_seed_draws() -> None:
-    assert json.loads(registered.PATH.read_text(encoding="utf-8")) == registered.draw()
+    for path, seed in registered.FILES.items():
+        assert json.loads(path.read_text(encoding="utf-8")) == registered.draw(seed)
+    assert not np.isin(
+        registered.read("earth", "rest", path=registered.SECOND)["inside"], registered.read("earth", "rest")["inside"]
+    ).any()
     places = registered.read("earth", "touchdown")
     assert {p: len(t) for p, t in places.items()} == registered.COUNTS
     with pytest.raises(InvalidParameterError, match="registered"):
@@ -166,6 +170,8 @@ def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path,
             CompareConfig(**changes)  # type: ignore[arg-type]
     with pytest.raises(InvalidParameterError, match=r"cut off after 0.06 s would overwrite"):
         CompareConfig(quick=True, write=True)
+    with pytest.raises(InvalidParameterError, match="first targets"):
+        CompareConfig(second=True, write=True)
     assert not CompareConfig(quick=True).shortened().write
 
 

@@ -45,6 +45,8 @@ class CompareConfig:
     """Training seeds of the policies: one number, or one for each of their budgets; None: the same."""
     targets: int | None = None
     """Registered targets of each place (inside, boundary, beyond) to use; None: all."""
+    second: bool = False
+    """Other targets, drawn when the methods' development was over, to confirm; not for --write."""
     perturbations: int = 8
     """Moved starts from which every answer is simulated again."""
     tries: tuple[int, ...] = (8, 32)
@@ -89,6 +91,8 @@ class CompareConfig:
                 "write: expected it without --quick, got both: hops cut off after 0.06 s would overwrite the measured results in "
                 "README.md and docs; leave one of them out"
             )
+        if self.second and self.write:
+            raise InvalidParameterError("write: expected the first targets, which the tables are of, got second; leave one out")
         counts = {"seeds": min(self.seeds, default=0), "perturbations": self.perturbations, "updates": self.updates}
         for name, value in counts.items():
             if value < 1:

@@ -68,12 +68,13 @@ def caption(outcome: Outcome) -> str:
         name = label(m).replace("the same, ", f"{label(outcome.methods[0]) if m.startswith('repeat') else 'ensemble'}, ")
         alike.setdefault(counts, []).append(name)
     seeds = "; ".join(f"{', '.join(names)}: {', '.join(map(str, counts))}" for counts, names in alike.items())
-    oracle = ""
+    oracle, which = "", "second " if config.second else ""
     if outcome.oracle is not None:
         calls = outcome.records["oracle"]["calls_per_answer"]
         oracle = f" CMA-ES on the simulator, {calls:.0f} hops an answer, comes to {_shown(outcome, outcome.oracle)}."
     return (
-        f"Interquartile mean landing error over {len(outcome.comparison.places['inside'])} targets inside the reachable region "
+        f"Interquartile mean landing error over {len(outcome.comparison.places['inside'])} {which}targets inside "
+        "the reachable region "
         f"and training seeds, after so many simulator calls learnt from; {config.perturbations} starts an answer, moved by "
         f"10 µm. Brackets: 95 % interval over seeds; parentheses, where seeds are fewer than {FEWEST_SEEDS}: their range. The "
         f"floor, how far moving its start carries a random hop's landing, is {_shown(outcome, outcome.floor)}; the best answers' "

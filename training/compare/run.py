@@ -58,7 +58,9 @@ class Comparison:
         self.scene = self.scenes.base
         self.hops = self._simulator()
         self.stages = Stages(Path(config.out), say=print if config.progress else lambda _: None)
-        self.places = registered.read(config.scene, config.landing, config.targets)
+        self.places = registered.read(
+            config.scene, config.landing, config.targets, registered.SECOND if config.second else registered.PATH
+        )
         self.targets = np.concatenate(list(self.places.values()))
         #: What every stage's record depends on.
         self.base = {"scene": asdict(self.scene), "fidelity": config.fidelity}

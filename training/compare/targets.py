@@ -1,6 +1,7 @@
 """The targets of the comparison, drawn once and kept in the repository before any method was run on them.
 
-``python -m training.compare.targets`` writes targets.json anew: the same numbers, as long as the reachable regions stay.
+Methods were developed with their errors on these in sight; second_targets.json was drawn when that was over, to confirm.
+``python -m training.compare.targets`` writes both anew: the same numbers, as long as the reachable regions stay.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from tensegrity_gym.scene import LANDINGS
 from tensegrity_gym.scene_ranges import SceneRanges, scene_ranges
 from tensegrity_gym.task import TARGET_PLACES, draw_episode, sample_targets
 
-PATH = Path(__file__).parent / "targets.json"
-SEED = 20261122
+#: Files, and the seeds that they were drawn with.
+FILES = {Path(__file__).parent / "targets.json": 20261122, Path(__file__).parent / "second_targets.json": 20261123}
+PATH, SECOND = FILES
 SCENES = ("earth", "moon", "slope")
 #: Scenes that vary, by name: level ground from the Moon's gravity to Earth's, from slippery to rough. Hops are followed for as
 #: long as on the Moon. Registered at touchdown alone: where a hop comes to rest is chaotic, and its reach as a function of
@@ -35,31 +37,31 @@ def scenes_of(name: str, landing: str, **changes: Any) -> SceneRanges:
     return SceneRanges(Scene.preset(name, landing=landing, **changes))
 
 
-def draw() -> dict[str, dict[str, dict[str, list[list[float]]]]]:
+def draw(seed: int = FILES[PATH]) -> dict[str, dict[str, dict[str, list[list[float]]]]]:
     """Targets by scene, landing and place [m], to a tenth of a millimetre; where scenes vary, with gravity and friction."""
     found: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
     for i, name in enumerate(SCENES):
         found[name] = {}
         for j, landing in enumerate(LANDINGS):
-            rng = np.random.default_rng([SEED, i, j])
+            rng = np.random.default_rng([seed, i, j])
             scene = Scene.preset(name, landing=landing)
             found[name][landing] = {
                 place: np.round(sample_targets(rng, count, scene, place), 4).tolist() for place, count in COUNTS.items()
             }
     for i, name in enumerate(VARIED, len(SCENES)):
-        rng = np.random.default_rng([SEED, i, LANDINGS.index("touchdown")])
+        rng = np.random.default_rng([seed, i, LANDINGS.index("touchdown")])
         scenes = scenes_of(name, "touchdown")
         drawn = {place: [draw_episode(rng, scenes, place).observation for _ in range(count)] for place, count in COUNTS.items()}
         found[name] = {"touchdown": {p: np.round(np.array(rows, dtype=np.float64), 4).tolist() for p, rows in drawn.items()}}
     return found
 
 
-def read(scene: str, landing: str, most: int | None = None) -> dict[str, np.ndarray]:
+def read(scene: str, landing: str, most: int | None = None, path: Path = PATH) -> dict[str, np.ndarray]:
     """The registered targets of a scene by place, each (n, 2) [m]; the first ``most`` of each place.
 
     Where scenes vary they are observations, (n, 2 + k): each target has a scene of its own.
     """
-    known = json.loads(PATH.read_text(encoding="utf-8"))
+    known = json.loads(path.read_text(encoding="utf-8"))
     if scene not in known or landing not in known[scene]:
         names = [f"{name} at {there}" for name, landings in sorted(known.items()) for there in sorted(landings)]
         raise InvalidParameterError(
@@ -69,5 +71,6 @@ def read(scene: str, landing: str, most: int | None = None) -> dict[str, np.ndar
 
 
 if __name__ == "__main__":
-    text = json.dumps(draw(), separators=(",", ":")).replace('{"', '{\n"').replace('},"', '},\n"')
-    PATH.write_text(text + "\n", encoding="utf-8")
+    for path, seed in FILES.items():
+        text = json.dumps(draw(seed), separators=(",", ":")).replace('{"', '{\n"').replace('},"', '},\n"')
+        path.write_text(text + "\n", encoding="utf-8")
