@@ -12,7 +12,6 @@ import tyro
 
 from surrogate import dataset, model
 from surrogate.dataset import SPLITS, HopData
-from surrogate.hops import PHYSICS, check_parts
 from surrogate.kriging import fit_process
 from surrogate.model import HopNet
 from surrogate.outputs import OUTPUTS, target_columns
@@ -125,9 +124,7 @@ def evaluate(
 
 def rows_of(config: EvaluateConfig, data: HopData, card: dict[str, Any]) -> HopData:
     """The hops that ``config.split`` names; DataFileError where the net was trained on another configuration."""
-    names = (*PHYSICS, "scene", "scene_ranges")
-    why, fix = "which the surrogate was trained on", "use data of the same configuration"
-    check_parts(data.configuration, card["configuration"], names, str(config.data), why, fix)
+    model.check_data(card, data.configuration, str(config.data))
     if config.split == "all":
         rows = data.rows(data.usable)
     elif config.split in SPLITS:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from surrogate.dataset import HopData
+from surrogate.hops import HopData, simulate_arguments
 from surrogate.outputs import OUTPUTS
-from tensegrity_gym import STRETCH_RANGE, Design, HopResult, Lattice, Scene, form_find, simulate
+from tensegrity_gym import STRETCH_RANGE, HopResult, form_find, simulate
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.specimen import POSITION, moved_start
 from tensegrity_gym.types import Floats
 
@@ -27,12 +24,11 @@ def measure_floor(data: HopData, hops: int) -> dict[str, dict[str, float]]:
     c = data.configuration
     if c.get("scene_ranges"):
         raise InvalidParameterError(f"floor: expected hops of one scene, got scenes that vary in {sorted(c['scene_ranges'])}")
-    settings: dict[str, Any] = {"scene": Scene(**c["scene"]), "lattice": Lattice(**c["lattice"])}
-    design, fidelity = Design(**c["design"]), Fidelity(**c.get("fidelity", {"precision": c["precision"]}))
-    how = {"dt": c["dt"], "design": design, "fidelity": fidelity, **settings}
+    how = simulate_arguments(c)
     rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
     random = np.random.default_rng(0)
-    start = form_find(data["stretches"][rows], design=fidelity.design(design), **settings)
+    modelled = how["fidelity"].design(how["design"])
+    start = form_find(data["stretches"][rows], design=modelled, scene=how["scene"], lattice=how["lattice"])
     reference = outputs_of(simulate(start.stretches, equilibria=start, **how))
     moved = outputs_of(simulate(start.stretches, equilibria=moved_start(start), **how))
     apart = {f"start moved by {POSITION:g} m": moved - reference}

@@ -132,6 +132,18 @@ class Configuration:
         return len(self.symmetries[0]) if self.symmetry else 1
 
 
+def simulate_arguments(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``simulate`` makes a file's hops with again, from its configuration; where scenes vary, ``scene`` is their base."""
+    return {
+        "design": Design(**configuration["design"]),
+        "scene": Scene(**configuration["scene"]),
+        "lattice": Lattice(**configuration["lattice"]),
+        # files from before fidelities say the precision alone
+        "fidelity": Fidelity(**configuration.get("fidelity", {"precision": configuration["precision"]})),
+        "dt": configuration["dt"],
+    }
+
+
 @dataclass(frozen=True)
 class HopData:
     """Hops as columns (batch first) and the configuration they were made with."""

@@ -19,13 +19,25 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
+from surrogate.hops import PHYSICS, check_parts
 from surrogate.outputs import LANDING, OUTPUTS, Output, scene_columns, target_columns
 from surrogate.schema import SCENE_VALUES
 from surrogate.storage import atomic_path, ensure_folder, read_json, write_json
 from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE, Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, InvalidStretchesError
 
-__all__ = ["OUTPUTS", "HopNet", "NetConfig", "Output", "Prediction", "load", "save", "scene_columns", "target_columns"]
+__all__ = [
+    "OUTPUTS",
+    "HopNet",
+    "NetConfig",
+    "Output",
+    "Prediction",
+    "check_data",
+    "load",
+    "save",
+    "scene_columns",
+    "target_columns",
+]
 
 FORMAT = "tensegrity_gym.surrogate/2"
 #: Factor on the usual initial weights of the first layer: landings vary within a small part of the range of stretches, which a
@@ -336,3 +348,13 @@ def load(path: Path | str) -> tuple[HopNet, dict[str, Any]]:
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError, json.JSONDecodeError) as error:
         raise DataFileError(f"{path}: expected a whole surrogate checkpoint ({error}); train it again") from error
     return net.eval(), card
+
+
+def check_data(card: Mapping[str, Any], configuration: Mapping[str, Any], where: str) -> None:
+    """DataFileError, which names ``where`` and what differs, unless hops are of the configuration that a card's net learnt from.
+
+    Seed, sampler and number of the hops may differ.
+    """
+    names = (*PHYSICS, "scene", "scene_ranges")
+    why, fix = "which the surrogate was trained on", "use data of the same configuration"
+    check_parts(configuration, card["configuration"], names, where, why, fix)

@@ -1,40 +1,24 @@
-"""Command line: ``python -m training demo|policy|compare``."""
+"""Command line: ``python -m training demo|plan|policy|compare``."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from typing import Annotated, Any
 
-import tyro
+from surrogate.command_line import run
 
-from tensegrity_gym.errors import TensegrityError
+#: Commands and their settings. Modules are imported on use: who asks for a plan need not wait for stable-baselines3.
+COMMANDS = {
+    "demo": ("training.demo", "DemoConfig"),
+    "plan": ("training.plan", "PlanCommand"),
+    "policy": ("training.train_policy", "PolicyCommand"),
+    "compare": ("training.compare.run", "CompareConfig"),
+}
 
 
 def main() -> int:
-    """Parse, run, and turn named errors into one line and exit status 1."""
-    from training import demo, train_policy
-    from training.compare import run as comparing
-    from training.compare.config import CompareConfig
-
-    command: Any = tyro.cli(  # type: ignore[operator]
-        Annotated[demo.DemoConfig, tyro.conf.subcommand("demo")]
-        | Annotated[train_policy.PolicyCommand, tyro.conf.subcommand("policy")]
-        | Annotated[CompareConfig, tyro.conf.subcommand("compare")],  # type: ignore[arg-type]
-        prog="python -m training",
-        description="The whole demo, a policy alone, or planners and policies compared.",
-    )
-    run: dict[type, Callable[[Any], None]] = {
-        demo.DemoConfig: demo.main,
-        train_policy.PolicyCommand: train_policy.main,
-        CompareConfig: comparing.main,
-    }
-    try:
-        run[type(command)](command)
-    except TensegrityError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 1
-    return 0
+    """Entry of ``python -m training``."""
+    said = "The whole demo, plans for targets, a policy alone, or planners and policies compared."
+    return run("python -m training", said, COMMANDS)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ class InverseConfig:
     """Answers whose expected error is above the least by no more than this share of it, or by ``LEAST_EQUAL``, count as equals,
     among which the least energy wins [-]."""
     miss: float = 0.01
-    """A target is called unreachable if the nearest known landing is farther away than this [m]."""
+    """A target is called unreachable if the landing expected nearest to it is farther away than this [m], and than its doubt."""
 
     def __post_init__(self) -> None:
         for name in ("pool", "starts", "steps"):
@@ -56,7 +56,7 @@ class Plans(NamedTuple):
     stretches: np.ndarray  #: shape (n, n_actuators) [-]
     landings: np.ndarray  #: expected, mean over the members, shape (n, 2) [m]
     errors: np.ndarray  #: expected, root mean square over members and scatter, shape (n,) [m]
-    reachable: np.ndarray  #: False where ``landings`` is only the nearest landing known, shape (n,)
+    reachable: np.ndarray  #: False where ``landings`` is only the nearest landing known, see ``InverseConfig.miss``, shape (n,)
 
 
 class InversePlanner:
@@ -106,21 +106,23 @@ class InversePlanner:
     @torch.no_grad()
     def plan(self, targets: np.ndarray) -> Plans:
         """Answers to targets (n, 2) [m], with what is expected of them."""
-        goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))
+        goal = torch.from_numpy(targets_of(targets).astype(np.float32))
         found, cost = self._search(goal, self.config.starts)
         best = cost.argmin(dim=1) if self.energy is None else self._least_energy(found, cost)
         rows = torch.arange(len(best))
-        landings = self.see(found[rows, best])[0]
+        landings, variance = self.see(found[rows, best])
         nearest = torch.linalg.norm(landings - goal, dim=1)
         errors = torch.sqrt(cost[rows, best])
-        return Plans(_in_range(found[rows, best]), landings.numpy(), errors.numpy(), (nearest <= self.config.miss).numpy())
+        # in great doubt it stays a little away from the target, where it is surer: that tells nothing of what can be reached
+        reachable = nearest <= torch.sqrt(variance).clamp(min=self.config.miss)
+        return Plans(_in_range(found[rows, best]), landings.numpy(), errors.numpy(), reachable.numpy())
 
     def propose(self, targets: np.ndarray, count: int) -> np.ndarray:
         """``count`` different answers to each target (n, 2) [m], best first, shape (n, count, n_actuators).
 
         Where descents end in fewer different places, the last ones repeat the best.
         """
-        goal = torch.from_numpy(np.asarray(targets, dtype=np.float32))
+        goal = torch.from_numpy(targets_of(targets).astype(np.float32))
         found, cost = self._search(goal, max(self.config.starts, 2 * count))
         order = cost.argsort(dim=1)
         found = torch.gather(found, 1, order[..., None].expand_as(found))

@@ -7,7 +7,7 @@ corrected by every hop (Broyden's rank-one update; Nocedal and Wright 2006, eq. 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,14 @@ from training.planner import Land, Prediction, SlopedPlanner, targets_of
 LONGEST_STEP = 0.05
 #: Length of steps, in stretches, over which landings scatter as much as they run: shorter ones hardly correct the slope.
 SCATTER_STEP = 1e-3
+
+
+class Refined(NamedTuple):
+    """The best hops simulated for n targets."""
+
+    stretches: np.ndarray  #: shape (n, n_actuators) [-]
+    landings: np.ndarray  #: where they landed, not-a-number where none flew, shape (n, 2) [m]
+    errors: np.ndarray  #: distance to the targets, infinite where none flew, shape (n,) [m]
 
 
 class RefiningPlanner:
@@ -36,7 +44,12 @@ class RefiningPlanner:
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Prediction:
         """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4); each costs ``tries`` simulator calls."""
-        targets = targets_of(observation)
+        best = self.refine(observation).stretches
+        return (best[0] if np.ndim(observation) == 1 else best), state
+
+    def refine(self, targets: np.ndarray) -> Refined:
+        """As :meth:`predict`, and where the best hops for targets (n, 2) [m] landed."""
+        targets = targets_of(targets)
         asked, _ = self.start.predict(targets)
         slope = self.start.slope(asked)
         best, there, least = asked, np.full(targets.shape, np.nan), np.full(len(targets), np.inf)
@@ -54,7 +67,7 @@ class RefiningPlanner:
                 # after a failed hop: half the way back to the best, or to the middle of the range where there is none
                 back = 0.5 * (asked + np.where(np.isfinite(least)[:, None], best, sum(STRETCH_RANGE) / 2))
                 asked = np.where(flew[:, None], np.clip(best + step, *STRETCH_RANGE), back)
-        return (best[0] if np.ndim(observation) == 1 else best), state
+        return Refined(best, there, least)
 
 
 def _updated(slope: Floats, moved: Floats, came: Floats) -> Floats:

@@ -53,7 +53,8 @@ class PolicyConfig:
     checkpoint_every: int = 512
     """Hops between two checkpoints, where there is a file to keep them in."""
     evaluate_every: int = 0
-    """Hops between two evaluations on 32 episodes of their own, which count as no training hops; 0: none."""
+    """Hops between two evaluations on 32 episodes of their own, which count as no training hops; 0: none. Their mean rewards
+    (minus the error over the reach) go to the progress bar, TensorBoard and the card (there since training was last resumed)."""
 
     @property
     def together(self) -> int:
@@ -73,6 +74,19 @@ class PolicyCommand(PolicyConfig):
     """Where a landing is read: rest or touchdown."""
     tensorboard: Path | None = None
     """Folder for TensorBoard."""
+
+
+class _Evaluated(BaseCallback):
+    """Hands on what an evaluation found."""
+
+    def __init__(self, found: list[dict[str, float]]) -> None:
+        super().__init__()
+        self.found = found
+
+    def _on_step(self) -> bool:
+        assert isinstance(self.parent, EvalCallback)
+        self.found.append({"calls": self.num_timesteps, "reward": float(self.parent.last_mean_reward)})
+        return True
 
 
 class _Watch(BaseCallback):
@@ -95,6 +109,8 @@ class _Watch(BaseCallback):
         self.hops, self.started = hops, started
         self.before = self.simulated_before = 0.0  # seconds that earlier runs took
         self.snapshots: dict[int, ActorPolicy] = {}
+        #: Hops so far and mean reward of each evaluation.
+        self.evaluations: list[dict[str, float]] = []
 
     def seconds(self) -> tuple[float, float]:
         """Wall time of this training so far, and that in the simulator, over all its runs [s]."""
@@ -104,7 +120,8 @@ class _Watch(BaseCallback):
         self.bar.update(self.num_timesteps - self.bar.n)
         errors = [info["error"] for info in self.locals["infos"]]
         self.logger.record_mean("rollout/landing_error", float(np.mean(errors)))
-        self.bar.set_postfix(error=f"{np.mean(errors):.3f} m", refresh=False)
+        evaluated = {"evaluated": f"{self.evaluations[-1]['reward']:.3f}"} if self.evaluations else {}
+        self.bar.set_postfix(error=f"{np.mean(errors):.3f} m", refresh=False, **evaluated)
         return True
 
     def _on_rollout_start(self) -> None:
@@ -172,23 +189,27 @@ def train_policy(
             before = model.num_timesteps
         callbacks: list[BaseCallback] = [watch]
         if config.evaluate_every:
-            callbacks.append(_evaluation(stack, scenes, scaling, config))
+            callbacks.append(_evaluation(stack, scenes, scaling, config, watch.evaluations))
         model.learn(config.calls - before, callback=CallbackList(callbacks), reset_num_timesteps=before == 0)
         watch.keep()
         calls = before + hops.simulator_calls
     if state is not None:
         state.unlink(missing_ok=True)
     card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": told, "simulator_calls": calls}
+    card |= {"evaluations": watch.evaluations} if config.evaluate_every else {}
     seconds, simulating = watch.seconds()
     return watch.snapshots, card | {"seconds": seconds, "simulating_seconds": simulating}
 
 
-def _evaluation(stack: contextlib.ExitStack, scenes: SceneRanges, scaling: Scaling, config: PolicyConfig) -> EvalCallback:
+def _evaluation(
+    stack: contextlib.ExitStack, scenes: SceneRanges, scaling: Scaling, config: PolicyConfig, found: list[dict[str, float]]
+) -> EvalCallback:
     venv = BatchedHopVecEnv(scenes, scaling, 16, check_fidelity(config.fidelity))
     venv.seed(config.seed + EVALUATION_SEED)
     monitored = stack.enter_context(contextlib.closing(VecMonitor(venv)))
     every = max(1, config.evaluate_every // config.together)
-    return EvalCallback(monitored, n_eval_episodes=32, eval_freq=every, verbose=0, warn=False)
+    told = _Evaluated(found)
+    return EvalCallback(monitored, callback_after_eval=told, n_eval_episodes=32, eval_freq=every, verbose=0, warn=False)
 
 
 def main(config: PolicyCommand) -> None:
@@ -199,3 +220,5 @@ def main(config: PolicyCommand) -> None:
     actors, card = train_policy(scene, plain, state=state, tensorboard=config.tensorboard)
     actors[config.calls].save(config.out, card)
     print(f"{config.out}: {card['algorithm']}, {card['simulator_calls']} simulator calls in {card['seconds']:.1f} s")
+    for found in card.get("evaluations", []):
+        print(f"  after {found['calls']} hops: mean reward {found['reward']:.3f} on 32 episodes")
