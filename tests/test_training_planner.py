@@ -77,6 +77,18 @@ def test_a_step_that_rounding_leaves_no_solution_is_damped(monkeypatch: pytest.M
     np.testing.assert_allclose(plans.stretches[:, :2], [(0.3, 0.2), (0.35, 0.2)], atol=1e-3)
 
 
+def test_a_target_that_doubt_keeps_it_away_from_is_not_called_unreachable() -> None:
+    """Two members put x at s0, and differ about y by a variance of 0.01 + 0.08 (s0 - 0.5): it stays 0.04 m short."""
+
+    def doubtful(stretches: Tensor) -> Tensor:
+        doubt = torch.sqrt(0.01 + 0.08 * (stretches[:, 0] - 0.5))
+        return torch.stack([torch.stack([stretches[:, 0], sign * doubt], dim=-1) for sign in (1.0, -1.0)])
+
+    plans = InversePlanner(doubtful).plan(np.array([(0.5, 0.0), (1.5, 0.0)]))
+    np.testing.assert_allclose(plans.landings, [(0.46, 0.0), (0.8, 0.0)], atol=1e-3)
+    assert plans.reachable.tolist() == [True, False]  # the first lies within the doubt of 0.08 m, the second beyond 0.18 m
+
+
 def test_beyond_an_arms_length_it_points_at_the_target() -> None:
     directions = np.linspace(-0.6, 0.6, 7)
     targets = 1.3 * np.column_stack([np.cos(directions), np.sin(directions)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,13 @@ from tensegrity_gym.scene_ranges import scene_ranges
 from tensegrity_gym.task import reach
 from training import train_policy as module
 from training.algorithms import hyperparameters
-from training.planner import NearestHopPlanner
+from training.inverse import InverseConfig, InversePlanner
+from training.planner import NearestHopPlanner, Planner
+from training.policies import ActorPolicy, _mlp
+from training.refine import RefiningPlanner
 from training.sb3_vec_env import BatchedHopVecEnv, make_env
 from training.similarity import Scaling
+from training.tandem import TandemConfig, TandemPlanner
 from training.train_policy import PolicyConfig, train_policy
 
 QUICK = Scene(duration=0.05)
@@ -170,18 +175,56 @@ def test_evaluation_and_tensorboard_do_not_change_training(tmp_path: Path) -> No
     )
     assert card["simulator_calls"] == 8
     assert list(tmp_path.glob("*/events*"))
+    # they are told without TensorBoard too
+    assert [found["calls"] for found in card["evaluations"]] == [4, 8]
+    assert all(-5 <= found["reward"] <= 0 for found in card["evaluations"])
     for name, values in plain[8].layers.state_dict().items():
         assert torch.equal(values, watched[8].layers.state_dict()[name])
 
 
-def test_planners_are_scored_by_stable_baselines3_as_policies_are() -> None:
+def linear(stretches: torch.Tensor) -> torch.Tensor:
+    """A map from stretches to landings, as an ensemble of one, (1, n, 2) [m]."""
+    return (stretches[None, :, :2] - 0.5) / 3
+
+
+PLANNERS: dict[str, Callable[[], Planner]] = {
+    "nearest": lambda: NearestHopPlanner(np.full((2, 4), 0.5), np.eye(2)),
+    "inverse": lambda: InversePlanner(linear, InverseConfig(pool=64)),
+    "refining": lambda: RefiningPlanner(
+        InversePlanner(linear, InverseConfig(pool=64)), lambda s: linear(torch.from_numpy(s))[0].numpy() + 0.01, 3
+    ),
+    "tandem": lambda: TandemPlanner(
+        lambda s: (linear(s)[0], torch.zeros(len(s))), np.random.default_rng(0).normal(size=(20, 2)), TandemConfig(steps=5)
+    ),
+    "actor": lambda: ActorPolicy(_mlp([2, 8, 4]), Scaling((0.155,))),
+}
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize("envs", [1, 3])
+def test_planners_are_scored_by_stable_baselines3_as_policies_are(name: str, envs: int) -> None:
     from tensegrity_gym.env import TensegrityHopEnv
 
-    env = VecMonitor(DummyVecEnv([lambda: TensegrityHopEnv(scene=QUICK)]))
+    planner, asked = PLANNERS[name](), []
+    predict = planner.predict
+
+    def watched(observation: np.ndarray, **how: Any) -> Any:
+        asked.append(observation.shape)
+        answers = predict(observation, **how)
+        assert answers[0].shape == (envs, 4)
+        return answers
+
+    planner.predict = watched  # type: ignore[method-assign, assignment]
+    env = VecMonitor(DummyVecEnv([lambda: TensegrityHopEnv(scene=QUICK)] * envs))
     env.seed(3)
-    planner = NearestHopPlanner(np.full((2, 4), 0.5), np.eye(2))
-    mean, _ = evaluate_policy(planner, env, n_eval_episodes=2)  # type: ignore[arg-type]
-    assert -5 <= mean <= 0
+    rewards, lengths = evaluate_policy(planner, env, n_eval_episodes=3, return_episode_rewards=True)  # type: ignore[arg-type]
+    assert lengths == [1, 1, 1]
+    assert all(-5 <= reward <= 0 for reward in rewards)
+    assert set(asked) == {(envs, 2)}
+    alone = gym.make("TensegrityHop-v0", scene=QUICK)
+    answer, state = PLANNERS[name]().predict(alone.reset(seed=3)[0])  # one observation, one answer, as gymnasium's loop has it
+    assert alone.action_space.contains(answer.astype(np.float32))
+    assert state is None
 
 
 def test_batched_envs_give_what_the_registered_env_gives_one_after_the_other() -> None:

@@ -27,6 +27,8 @@ from training.planner import Land, targets_of
 from training.refine import RefiningPlanner
 from training.varied import fit_varied_kriging
 
+#: Added to the seed of the starts: hops of a file with that seed are points of the same sequence, and starts already.
+START_SEED = 2_000_003
 #: Descents per target where scenes vary, at least: starts are chosen by the net alone, which tells less of them.
 VARIED_STARTS = 32
 
@@ -88,7 +90,7 @@ def planner_of(
     if not len(known):
         raise InvalidParameterError(f"{where}: expected at least one hop that did not fail, got none of {len(data)}")
     stretches, energy = known["stretches"], fit_energy(known["stretches"], known["stored_energy"])
-    of_all: dict[str, Any] = {"energy": energy, "n_actuators": stretches.shape[1], "seed": seed}
+    of_all: dict[str, Any] = {"energy": energy, "n_actuators": stretches.shape[1], "seed": seed + START_SEED}
     if not at:
         kriging = fit_kriging(net, known, held, 0.0, floor)
         return InversePlanner(FrozenLanding(net), config, correction=kriging, stored=stretches, **of_all)
