@@ -353,8 +353,8 @@ def load(path: Path | str) -> tuple[HopNet, dict[str, Any]]:
 def check_data(card: Mapping[str, Any], configuration: Mapping[str, Any], where: str) -> None:
     """DataFileError, which names ``where`` and what differs, unless hops are of the configuration that a card's net learnt from.
 
-    Seed, sampler and number of the hops may differ.
+    Seed, sampler and number of the hops may differ; ``lengths`` is there where they are other than metres in the hop's scene.
     """
-    names = (*PHYSICS, "scene", "scene_ranges")
+    names = (*PHYSICS, "scene", "scene_ranges", "lengths")
     why, fix = "which the surrogate was trained on", "use data of the same configuration"
     check_parts(configuration, card["configuration"], names, where, why, fix)

@@ -17,11 +17,13 @@ from surrogate.train import train
 from tensegrity_gym import Design, HopStatus, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.fidelity import Fidelity
+from tensegrity_gym.scene_ranges import scene_ranges
 from tests.test_surrogate_model import LATTICE, QUICK, closed_form_data
 from training import __main__ as command_line
 from training import plan
 from training.inverse import InverseConfig
 from training.plan import PlanCommand, ask, planner_of, simulator_of
+from training.similarity import alike_data
 
 POOL = InverseConfig(pool=512)
 
@@ -196,6 +198,10 @@ def test_hops_of_scenes_that_vary_are_planned_in_the_one_asked_for(tmp_path: Pat
     ):
         with pytest.raises(InvalidParameterError, match=said):
             planner_of(net, card, data, at=at)
+    alike = alike_data(data, scene_ranges(dict(configuration.scene_ranges)))
+    net, card = train(alike, replace(QUICK, epochs=1), progress=False)
+    with pytest.raises(DataFileError, match="expected lengths 'as on Earth'"):  # a net of the comparison, and a file in metres
+        planner_of(net, card, data, at={"friction": 0.5, "gravity": 3.0})
     tilted = replace(configuration, scene_ranges={"restitution": (0.0, 0.5)})
     bouncing = HopData(flat.columns | {"scene_restitution": rng.uniform(0.0, 0.5, 1200)}, tilted.as_dict())
     net, card = train(bouncing, replace(QUICK, epochs=1), progress=False)

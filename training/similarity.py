@@ -50,11 +50,11 @@ def alike(observations: ArrayLike, scenes: SceneRanges) -> tuple[Floats, Floats]
 
 
 def alike_data(data: HopData, scenes: SceneRanges) -> HopData:
-    """Hops with their lengths and times of flight as they would be on Earth."""
+    """Hops with their lengths and times of flight as they would be on Earth; their configuration says so, as ``lengths``."""
     values = np.column_stack([data[f"scene_{name}"] for name in scenes.observed])
     factor = likeness(values, scenes.observed)
     columns = {name: data[name] * (factor if data[name].ndim == 1 else factor[:, None]) for name in BALLISTIC}
-    return replace(data, columns=data.columns | columns)
+    return replace(data, columns=data.columns | columns, configuration=data.configuration | {"lengths": "as on Earth"})
 
 
 @dataclass(frozen=True)
