@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -43,11 +44,12 @@ def by_budget(outcome: Outcome) -> str:
         [
             label(m),
             str(answer_calls(m)),
+            ", ".join(str(len(outcome.scores[m, b])) if b in outcome.budgets(m) else "–" for b in budgets),
             *(_cell(outcome.summary(m, b), outcome.factor) if b in outcome.budgets(m) else "" for b in budgets),
         ]
         for m in outcome.methods
     ]
-    return table([f"error [{outcome.shown}]", "hops per answer", *(f"after {_spaced(b)}" for b in budgets)], rows)
+    return table([f"error [{outcome.shown}]", "hops per answer", "seeds", *(f"after {_spaced(b)}" for b in budgets)], rows)
 
 
 def _budgets(outcome: Outcome) -> list[int]:
@@ -59,29 +61,21 @@ def _spaced(number: int) -> str:
 
 
 def caption(outcome: Outcome) -> str:
-    """What the table of :func:`by_budget` shows, of how many seeds, and when it was run."""
+    """What the table of :func:`by_budget` shows, and when it was run."""
     config, (first, last) = outcome.comparison.config, outcome.dates
-    budgets = _budgets(outcome)
-    alike: dict[tuple[int, ...], list[str]] = {}
-    for m in outcome.methods:
-        counts = tuple(len(outcome.scores.get((m, b), ())) for b in budgets)
-        name = label(m).replace("the same, ", f"{label(outcome.methods[0]) if m.startswith('repeat') else 'ensemble'}, ")
-        alike.setdefault(counts, []).append(name)
-    seeds = "; ".join(f"{', '.join(names)}: {', '.join(map(str, counts))}" for counts, names in alike.items())
     oracle, which = "", "second " if config.second else ""
     if outcome.oracle is not None:
         calls = outcome.records["oracle"]["calls_per_answer"]
         oracle = f" CMA-ES on the simulator, {calls:.0f} hops an answer, comes to {_shown(outcome, outcome.oracle)}."
-    return (
-        f"Interquartile mean landing error over {len(outcome.comparison.places['inside'])} {which}targets inside "
-        "the reachable region "
-        f"and training seeds, after so many simulator calls learnt from; {config.perturbations} starts an answer, moved by "
-        f"10 µm. Brackets: 95 % interval over seeds; parentheses, where seeds are fewer than {FEWEST_SEEDS}: their range. The "
+    text = (
+        f"Interquartile mean landing error over {len(outcome.comparison.places['inside'])} {which}targets inside the reachable "
+        f"region and training seeds, after so many simulator calls learnt from; {config.perturbations} starts an answer, moved "
+        f"by 10 µm. Brackets: 95 % interval over seeds; parentheses, where seeds are fewer than {FEWEST_SEEDS}: their range. The "
         f"floor, how far moving its start carries a random hop's landing, is {_shown(outcome, outcome.floor)}; the best answers' "
         f"landings lie {_shown(outcome, outcome.scatter)} from their own mean.{oracle} "
-        f"Seeds at {', '.join(_spaced(b) for b in budgets)} calls: {seeds}. "
         f"Run {'on ' + first if first == last else f'from {first} to {last}'}."
     )
+    return textwrap.fill(text, 128)
 
 
 def by_place(outcome: Outcome) -> str:

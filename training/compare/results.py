@@ -30,7 +30,9 @@ def label(method: str) -> str:
     """A method's name in tables and figures."""
     if method.startswith("best"):
         return f"the same, best of {method[4:]} simulated"
-    if method.startswith(("repeat", "refine")):
+    if method.startswith("repeat"):
+        return f"nearest stored hop, {answer_calls(method)} simulated in turn"
+    if method.startswith("refine"):
         return f"the same, {answer_calls(method)} simulated in turn"
     if method.startswith("bayes"):
         return f"the same, {answer_calls(method)} simulated in turn by BoTorch"
