@@ -16,10 +16,12 @@ from torch import Tensor
 
 from surrogate.model import HopNet
 from surrogate.outputs import LANDING
+from tensegrity_gym.task import reach
 from training.compare.config import CompareConfig
 from training.compare.run import Comparison
 from training.compare.statistics import interquartile_mean
 from training.inverse import InversePlanner
+from training.score import distances
 
 Correction = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -78,7 +80,7 @@ def main(config: CompareConfig) -> None:
                 fitted.landing, config.inverse, correction=correction, energy=usual.energy, stored=stored, seed=seed
             )
             landings = comparison.hops.perturbed(planner.predict(inside)[0], config.perturbations)[:, 1:]
-            errors = np.linalg.norm(landings - inside[:, None, :2], axis=2).mean(axis=1)
+            errors = distances(landings, inside, reach(comparison.scene)).mean(axis=1)
             apart = np.linalg.norm(landings - landings.mean(axis=1, keepdims=True), axis=2).mean(axis=1)
             found.setdefault((name, budget), []).append(np.stack([errors, apart]))
     print(f"{'':<56}{'error and scatter [mm] after':>30}")

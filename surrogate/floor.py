@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from surrogate.hops import HopData, simulate_arguments
 from surrogate.outputs import OUTPUTS
-from tensegrity_gym import STRETCH_RANGE, HopResult, form_find, simulate
+from tensegrity_gym import STRETCH_RANGE, Equilibria, HopResult, form_find, simulate
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.specimen import POSITION, moved_start
 from tensegrity_gym.types import Floats
@@ -27,8 +29,7 @@ def measure_floor(data: HopData, hops: int) -> dict[str, dict[str, float]]:
     how = simulate_arguments(c)
     rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
     random = np.random.default_rng(0)
-    modelled = how["fidelity"].design(how["design"])
-    start = form_find(data["stretches"][rows], design=modelled, scene=how["scene"], lattice=how["lattice"])
+    start = start_of(data["stretches"][rows], how)
     reference = outputs_of(simulate(start.stretches, equilibria=start, **how))
     moved = outputs_of(simulate(start.stretches, equilibria=moved_start(start), **how))
     apart = {f"start moved by {POSITION:g} m": moved - reference}
@@ -42,6 +43,11 @@ def measure_floor(data: HopData, hops: int) -> dict[str, dict[str, float]]:
         name: {o.name: float(np.sqrt(np.nanmean(change[:, k] ** 2))) for k, o in enumerate(OUTPUTS)}
         for name, change in apart.items()
     }
+
+
+def start_of(stretches: Floats, how: dict[str, Any]) -> Equilibria:
+    """Equilibria of stretches (n, n_actuators) that ``simulate(stretches, **how)`` would start from."""
+    return form_find(stretches, design=how["fidelity"].design(how["design"]), scene=how["scene"], lattice=how["lattice"])
 
 
 def outputs_of(result: HopResult) -> Floats:

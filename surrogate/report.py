@@ -6,19 +6,19 @@ import base64
 import html
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
 
 from surrogate import dataset
-from surrogate.hops import HopData
+from surrogate.floor import start_of
+from surrogate.hops import HopData, simulate_arguments
 from surrogate.scenes import comparable, unit_of
 from surrogate.storage import atomic_path, ensure_folder
-from tensegrity_gym import ENERGY_NAMES, Design, HopStatus, Lattice, Scene, form_find, simulate
+from tensegrity_gym import ENERGY_NAMES, HopStatus, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.events import flew
-from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.specimen import moved_start
 
 STYLE = """
@@ -103,12 +103,9 @@ def measured_floor(data: HopData, hops: int) -> dict[str, str]:
     """How far landings move when the masses of a start are moved (`moved_start`): nothing predicts them better than that."""
     from surrogate import figures
 
-    c = data.configuration
-    settings: dict[str, Any] = {"scene": Scene(**c["scene"]), "lattice": Lattice(**c["lattice"])}
-    design, fidelity = Design(**c["design"]), Fidelity(**c.get("fidelity", {"precision": c["precision"]}))
+    how = simulate_arguments(data.configuration)
     rows = np.flatnonzero(data.usable & (data["image"] == 0))[:hops]
-    start = form_find(data["stretches"][rows], design=fidelity.design(design), **settings)
-    how = {"dt": c["dt"], "design": design, "fidelity": fidelity, **settings}
+    start = start_of(data["stretches"][rows], how)
     pair = [simulate(start.stretches, equilibria=e, **how) for e in (start, moved_start(start))]
     said = {}
     for name in reversed(figures.places(data.rows(rows))):

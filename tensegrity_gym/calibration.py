@@ -19,14 +19,14 @@ from tensegrity_gym.formfinding import STRETCH_RANGE, Equilibria, form_find
 from tensegrity_gym.hops import HopResult, hop
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import LANDINGS, Scene
-from tensegrity_gym.specimen import Specimen
+from tensegrity_gym.specimen import POSITION, Specimen
 from tensegrity_gym.timestep import default_time_step
 from tensegrity_gym.types import Floats
 from tensegrity_gym.version import MODEL_VERSION
 
 FOLDER = Path(__file__).parent / "calibrations"
-#: What no one can know: positions of the masses [m] and stiffnesses of the members [-], standard deviations.
-POSITION, MATERIAL = 1e-5, 1e-3
+#: What no one can know, besides positions (``POSITION``): stiffnesses of the members [-], standard deviation.
+MATERIAL = 1e-3
 #: Starts, each unknown in its own way, whose largest shift of the landing is a hop's floor.
 UNKNOWNS = 4
 #: Share of the sampled hops whose error a model's ``error`` bounds.

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from maps import throw
 
 from surrogate.generate import sample_stretches
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
@@ -23,15 +23,6 @@ from training.compare.config import CompareConfig
 from training.compare.results import Outcome, label
 from training.inverse import InversePlanner
 from training.planner import Land
-
-
-def throw(stretches: Tensor) -> Tensor:
-    """Ballistic throw: two numbers steer speed and elevation, two the azimuth; as an ensemble of one, (1, n, 2) [m]."""
-    speed = 1.0 + 2.0 * stretches[:, 0]
-    elevation = 0.4 + stretches[:, 1]
-    azimuth = 6.0 * (stretches[:, 2] - stretches[:, 3])
-    distance = speed**2 * torch.sin(2 * elevation) / 9.81
-    return torch.stack([distance * torch.cos(azimuth), distance * torch.sin(azimuth)], dim=-1)[None]
 
 
 def real(stretches: np.ndarray) -> np.ndarray:

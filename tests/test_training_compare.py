@@ -19,13 +19,14 @@ from tensegrity_gym import Scene, form_find, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.fidelity import FIDELITIES
 from tensegrity_gym.scene_ranges import scene_ranges
+from tensegrity_gym.specimen import POSITION, moved_start
 from tensegrity_gym.task import reach, reachable
 from training.compare import report, run
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.results import Outcome
 from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
-from training.hops import PERTURBATION, Hops, VariedHops, repeated
+from training.hops import Hops, VariedHops, repeated
 from training.inverse import InversePlanner
 
 QUICK = Scene(duration=0.05)
@@ -84,6 +85,17 @@ def test_registered_targets_are_what_their_seed_draws() -> None:
         registered.read("mars", "rest")
 
 
+def test_a_moved_start_moves_what_stands_by_ten_micrometres_each_way_and_nothing_that_lies() -> None:
+    found = form_find(np.array([(0.3, 0.4, 0.5, 0.6), (0.5, 0.5, 0.4, 0.3)]), scene=QUICK)
+    moved = moved_start(found).positions - found.positions
+    lying = found.positions[:, :, 2] < 1e-3
+    assert 4 <= lying.sum() < 0.2 * lying.size
+    assert (moved[lying] == 0).all()
+    assert moved[~lying].std(axis=0) == pytest.approx([1e-5] * 3, rel=0.12)  # of some 350 masses: 4 % standard deviation
+    assert np.array_equal(moved_start(found).positions, moved_start(found, 0).positions)
+    assert not np.array_equal(moved_start(found).positions, moved_start(found, 1).positions)
+
+
 def test_moved_starts_are_moved_by_what_is_said_and_the_first_not_at_all() -> None:
     stretches = np.array([(0.3, 0.4, 0.5, 0.6), (0.5, 0.5, 0.4, 0.3)])
     hops = Hops(QUICK, {})
@@ -94,7 +106,7 @@ def test_moved_starts_are_moved_by_what_is_said_and_the_first_not_at_all() -> No
     np.testing.assert_array_equal(landings[:, 1:], hops.moved(stretches, 3))
     moved = np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2)
     assert (moved > 0).all()
-    assert (moved < 100 * PERTURBATION).all()
+    assert (moved < 100 * POSITION).all()
     twice = repeated(form_find(stretches, scene=QUICK), 2)
     np.testing.assert_array_equal(twice.stretches, stretches[[0, 0, 1, 1]])
     np.testing.assert_array_equal(twice.energies["bars"][::2], twice.energies["bars"][1::2])
@@ -136,6 +148,22 @@ def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Pa
     landings = np.array(kept["results"]["landings"])[:2, 1:]
     wanted = np.linalg.norm(landings - again.places["inside"][:, None], axis=2).mean(axis=1)
     np.testing.assert_allclose(outcome.errors("ensemble", 32)[1], wanted)
+
+
+def test_scatter_is_about_the_answers_own_mean(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Landings with a known deviation, far off their targets: two starts tell as much of it as many."""
+    again = run.Comparison(CompareConfig(out=folder.parent, quick=True, progress=False).shortened())
+    again.run()
+    outcome = Outcome(again)
+    rng = np.random.default_rng(0)
+    for starts in (2, 64):
+        landings = 3.0 + rng.normal(0, 1e-3, (200, 20, starts, 2))
+        monkeypatch.setattr(outcome, "_landings", lambda *_, drawn=landings: drawn)
+        monkeypatch.setattr(outcome, "unit", np.ones(1))
+        monkeypatch.setattr(outcome, "rows", {"inside": np.array([True])})
+        monkeypatch.setattr(outcome, "errors", lambda *_: np.ones((1, 1)))
+        # mean length of a plane normal vector: sqrt(pi / 2) deviations; trimming skews the mean of two by some per cent
+        assert outcome.scatter == pytest.approx(1e-3 * np.sqrt(np.pi / 2), rel=0.08 if starts == 2 else 0.02)
 
 
 def test_more_seeds_keep_what_was_run(folder: Path) -> None:

@@ -19,9 +19,10 @@ from surrogate.train import TrainConfig, train
 from tensegrity_gym import MODEL_VERSION, Scene, simulate
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.fidelity import Fidelity
+from tensegrity_gym.specimen import POSITION
 from tensegrity_gym.task import reach
 from training import figures, report
-from training.hops import PERTURBATION, SEED, Hops
+from training.hops import SEED, Hops
 from training.inverse import InverseConfig, InversePlanner
 from training.planner import NearestHopPlanner, Planner
 from training.policies import ActorPolicy
@@ -220,7 +221,7 @@ def _evaluation(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopD
                 bar.update(hops.calls - bar.n)
         return {"floor": floor.tolist(), **scores}
 
-    settings = {"budgets": budgets, "starts": starts, "moved": PERTURBATION, "seed": SEED, "fidelity": SCORED_BY[scene.landing]}
+    settings = {"budgets": budgets, "starts": starts, "moved": POSITION, "seed": SEED, "fidelity": SCORED_BY[scene.landing]}
     stages.run("evaluation", settings, work, needs=["plans", "policy", "targets"])
 
 
@@ -274,7 +275,7 @@ def _report(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, hel
             "reach [m]": f"{reach(scene):.3f}",
             "failed hops": f"{results['data']['failed']} of {len(data)}",
             "physics version": MODEL_VERSION,
-            "answers scored by": f"fidelity {SCORED_BY[config.landing]}, starts moved by {1e6 * PERTURBATION:g} µm",
+            "answers scored by": f"fidelity {SCORED_BY[config.landing]}, starts moved by {1e6 * POSITION:g} µm",
             "packages": ", ".join(f"{k} {v}" for k, v in package_versions().items()),
         }
         closures = {"shown": results["hop"]["closure_percent"], "data": results["data"]["closure_percent"]}

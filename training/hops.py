@@ -13,10 +13,9 @@ from tensegrity_gym import Design, Equilibria, HopResult, Scene, form_find, simu
 from tensegrity_gym.batch import thread_count
 from tensegrity_gym.fidelity import named_fidelity
 from tensegrity_gym.scene_ranges import SceneRanges
+from tensegrity_gym.specimen import LYING, POSITION
 from tensegrity_gym.types import Floats
 
-#: Standard deviation by which each mass above the ground is moved at the start [m]: what nobody can know.
-PERTURBATION = 1e-5
 #: Seed of the perturbations: the same for every plan.
 SEED = 777
 
@@ -51,8 +50,8 @@ class Hops:
 
     def _from_moved(self, found: Equilibria, times: int) -> Floats:
         n, moved = len(found.stretches), repeated(found, times)
-        noise = np.random.default_rng(SEED).normal(0, PERTURBATION, (times, *found.positions.shape[1:]))
-        above = moved.positions[:, :, 2:] > 1e-3
+        noise = np.random.default_rng(SEED).normal(0, POSITION, (times, *found.positions.shape[1:]))
+        above = moved.positions[:, :, 2:] > LYING
         moved = replace(moved, positions=moved.positions + np.tile(noise, (n, 1, 1)) * above)
         return _landings(self.simulate(moved.stretches, moved)).reshape(n, times, 2)
 

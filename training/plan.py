@@ -25,12 +25,10 @@ from tensegrity_gym.types import Floats
 from training.inverse import InverseConfig, InversePlanner, fit_energy
 from training.planner import Land, targets_of
 from training.refine import RefiningPlanner
-from training.varied import fit_varied_kriging
+from training.varied import VARIED_STARTS, fit_varied_kriging
 
 #: Added to the seed of the starts: hops of a file with that seed are points of the same sequence, and starts already.
 START_SEED = 2_000_003
-#: Descents per target where scenes vary, at least: starts are chosen by the net alone, which tells less of them.
-VARIED_STARTS = 32
 
 
 @dataclass(frozen=True)

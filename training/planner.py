@@ -70,9 +70,7 @@ class NearestHopPlanner:
         self.landings = np.asarray(landings, dtype=np.float64)
         self.strangeness = strangeness
         n_actuators = self.stretches.shape[1]
-        permutations, signs = (np.arange(n_actuators)[None], np.ones((1, 2))) if images is None else images
-        self._seen = self.stretches[:, permutations].reshape(-1, n_actuators)
-        self._landed = (self.landings[:, None] * signs).reshape(-1, 2)
+        self.images = (np.arange(n_actuators)[None], np.ones((1, 2))) if images is None else images
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -85,14 +83,18 @@ class NearestHopPlanner:
         return (chosen[0] if np.ndim(observation) == 1 else chosen), state
 
     @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(self._seen)
+    def _known(self) -> tuple[KDTree, np.ndarray]:
+        """All images of the stored hops: a tree of their stretches, and where they landed, shape (g m, 2) [m]."""
+        permutations, signs = self.images
+        seen = self.stretches[:, permutations].reshape(-1, self.stretches.shape[1])
+        return KDTree(seen), (self.landings[:, None] * signs).reshape(-1, 2)
 
     def slope(self, stretches: np.ndarray) -> np.ndarray:
         """Of the plane fitted to the landings of the nearest stored hops and their images; see ``SlopedPlanner``."""
-        near = self._tree.query(stretches, min(NEIGHBOURS, len(self._seen)))[1].reshape(len(stretches), -1)
-        away = self._seen[near] - np.asarray(stretches)[:, None]
-        plane = np.linalg.pinv(np.concatenate([np.ones((*near.shape, 1)), away], axis=2)) @ self._landed[near]
+        tree, landed = self._known
+        near = tree.query(stretches, min(NEIGHBOURS, tree.n))[1].reshape(len(stretches), -1)
+        away = tree.data[near] - np.asarray(stretches)[:, None]
+        plane = np.linalg.pinv(np.concatenate([np.ones((*near.shape, 1)), away], axis=2)) @ landed[near]
         return plane[:, 1:].swapaxes(1, 2)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from surrogate.storage import atomic_path
-from training.hops import PERTURBATION
+from tensegrity_gym.specimen import POSITION
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("method", "method", "s"),
@@ -39,7 +39,7 @@ def scored(floor: np.ndarray, starts: int) -> str:
     """How errors were measured, and the floor under them; ``floor``: of each target's own hop, shape (n,) [m]."""
     median, mean = 1e3 * float(np.median(floor)), 1e3 * float(floor.mean())
     return (
-        f"Errors: mean distance to the target from {starts} starts, masses above the ground moved by {1e6 * PERTURBATION:g} µm. "
+        f"Errors: mean distance to the target from {starts} starts, masses above the ground moved by {1e6 * POSITION:g} µm. "
         f"Floor: such moves alone carry the landings of the targets' own hops by {median:.2g} mm (mean {mean:.2g} mm)."
     )
 

@@ -26,6 +26,8 @@ from training.similarity import alike
 
 #: Neighbours of each hop that tell how its landing changes with stretches and scene.
 NEIGHBOURS = 8
+#: Descents per target, at least: starts are chosen by the net alone, which tells less of them than kriging in one scene does.
+VARIED_STARTS = 32
 
 
 class VariedPlanner:

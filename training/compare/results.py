@@ -29,7 +29,7 @@ LABELS = {
 def label(method: str) -> str:
     """A method's name in tables and figures."""
     if method.startswith("best"):
-        return f"the same, best of {method[4:]} simulated"
+        return f"the same, best of {answer_calls(method)} simulated"
     if method.startswith("repeat"):
         return f"nearest stored hop, {answer_calls(method)} simulated in turn"
     if method.startswith("refine"):
@@ -47,11 +47,9 @@ def answer_calls(method: str) -> int:
 def _place(method: str) -> tuple[int, int]:
     """Order of methods in tables: best-of-T follows the planner that proposes."""
     known = list(LABELS)
-    if method.startswith("best"):
-        return known.index("ensemble"), int(method[4:])
-    for k, prefix in enumerate(("repeat", "refine", "bayes")):
+    for k, (prefix, start) in enumerate(SIMULATING.items()):
         if method.startswith(prefix):
-            return known.index(SIMULATING[prefix]), 1000 * (k + 1) + answer_calls(method)
+            return known.index(start), 1000 * (k + 1) + answer_calls(method)
     return (known.index(method) if method in known else len(known)), 0
 
 

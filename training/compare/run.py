@@ -207,26 +207,27 @@ class Comparison:
             self._score(f"best{tries}", seed, budget, f"best_{tag}", partial(self._kept, f"best_{tag}", str(tries)))
 
     def _refined(self, start: str, tries: int, seed: int, budget: int) -> None:
-        method, tag = f"{REFINED[start]}{tries}", f"{seed}_{budget}"
-        name = f"{method}_{tag}"
-
-        def work() -> Results:
-            planner = self._refining(self.fitted(seed, budget), start, tries)
-            return {"stretches": planner.predict(self.targets)[0].tolist()}
-
-        self.stages.run(name, {"tries": tries, "method": "secant"}, work, needs=[f"plans_{tag}"])
-        self._score(method, seed, budget, name, lambda: self.stages.results[name])
+        method = f"{REFINED[start]}{tries}"
+        settings = {"tries": tries, "method": "secant"}
+        self._tried(method, method, settings, lambda fitted: self._refining(fitted, start, tries), seed, budget)
 
     def _bayesian(self, seed: int, budget: int) -> None:
-        name, tries = f"bayes_{seed}_{budget}", self.config.bayes
+        tries = self.config.bayes
+        settings = {"tries": tries, "process": asdict(BayesianConfig())}
+        self._tried(f"bayes{tries}", "bayes", settings, lambda fitted: self._optimising(fitted, tries), seed, budget)
+
+    def _tried(
+        self, method: str, stage: str, settings: Results, planner: Callable[[Any], Planner], seed: int, budget: int
+    ) -> None:
+        """Answers of a planner that tries hops, and their score."""
+        tag = f"{seed}_{budget}"
+        name = f"{stage}_{tag}"
 
         def work() -> Results:
-            planner = self._optimising(self.fitted(seed, budget), tries)
-            return {"stretches": planner.predict(self.targets)[0].tolist()}
+            return {"stretches": planner(self.fitted(seed, budget)).predict(self.targets)[0].tolist()}
 
-        settings = {"tries": tries, "process": asdict(BayesianConfig())}
-        self.stages.run(name, settings, work, needs=[f"plans_{seed}_{budget}"])
-        self._score(f"bayes{tries}", seed, budget, name, lambda: self.stages.results[name])
+        self.stages.run(name, settings, work, needs=[f"plans_{tag}"])
+        self._score(method, seed, budget, name, lambda: self.stages.results[name])
 
     def _best(self, fitted: Any, tries: int) -> Planner:
         return BestOfPlanner(fitted.inverse, self.hops.land, tries)

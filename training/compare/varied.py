@@ -29,10 +29,15 @@ from training.refine import RefiningPlanner
 from training.similarity import alike_data, likeness
 from training.stages import Results
 from training.tandem import TandemPlanner
-from training.varied import NearestVariedHops, ScaledScenes, VariedEvolution, VariedPlanner, fit_varied_kriging, scene_values
-
-#: Descents per target, at least: starts are chosen by the net alone, which tells less of them than kriging in one scene does.
-STARTS = 32
+from training.varied import (
+    VARIED_STARTS,
+    NearestVariedHops,
+    ScaledScenes,
+    VariedEvolution,
+    VariedPlanner,
+    fit_varied_kriging,
+    scene_values,
+)
 
 
 class VariedComparison(Comparison):
@@ -160,7 +165,7 @@ class VariedFitted:
     @one_thread()
     def planner(self, values: Floats) -> InversePlanner:
         """The robust planner of one scene, of ``values`` (k,) [SI]."""
-        settings = replace(self.config.inverse, starts=max(STARTS, self.config.inverse.starts))
+        settings = replace(self.config.inverse, starts=max(VARIED_STARTS, self.config.inverse.starts))
         planner = InversePlanner(self.landing.at(values), settings, energy=self.energy, seed=self.seed)
         if self.kriging is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
             planner.correction = self.kriging.at(values)
