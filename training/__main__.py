@@ -1,4 +1,4 @@
-"""Command line: ``python -m training demo|plan|policy|compare``."""
+"""Command line: ``python -m training demo|plan|policy|tune|compare``."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ COMMANDS = {
     "demo": ("training.demo", "DemoConfig"),
     "plan": ("training.plan", "PlanCommand"),
     "policy": ("training.train_policy", "PolicyCommand"),
+    "tune": ("training.tune", "TuneConfig"),
     "compare": ("training.compare.run", "CompareConfig"),
 }
 
 
 def main() -> int:
     """Entry of ``python -m training``."""
-    said = "The whole demo, plans for targets, a policy alone, or planners and policies compared."
+    said = "The whole demo, plans for targets, a policy alone or tuned, or planners and policies compared."
     return run("python -m training", said, COMMANDS)
 
 

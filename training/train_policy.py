@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecMonitor
 from tqdm import tqdm
 
@@ -182,6 +183,8 @@ def train_policy(
             tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
         )
         model = build(config.algorithm, values, venv, config.calls, config.seed, tensorboard)
+        if tensorboard is None:
+            model.set_logger(Logger(None, []))  # its own would leave an empty folder in the system's for temporary files
         watch = _Watch(config, [*budgets, config.calls], scaling, bar, state, settings, hops, started)
         before = 0
         if state is not None and state.exists():

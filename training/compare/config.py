@@ -43,6 +43,9 @@ class CompareConfig:
     """Budgets of the policies; None: the same."""
     policy_seeds: tuple[int, ...] | None = None
     """Training seeds of the policies: one number, or one for each of their budgets; None: the same."""
+    hyperparameters: Path | None = None
+    """Folder of sac.toml, td3.toml and ppo.toml to train policies with, such as `python -m training tune` writes; None: the
+    committed ones. Not for --write."""
     targets: int | None = None
     """Registered targets of each place (inside, boundary, beyond) to use; None: all."""
     second: bool = False
@@ -93,6 +96,11 @@ class CompareConfig:
             )
         if self.second and self.write:
             raise InvalidParameterError("write: expected the first targets, which the tables are of, got second; leave one out")
+        if self.hyperparameters is not None and self.write:
+            raise InvalidParameterError(
+                f"write: expected it without --hyperparameters, as the tables are of the committed ones, got both; copy "
+                f"{self.hyperparameters} to training/hyperparameters, or leave one of them out"
+            )
         counts = {"seeds": min(self.seeds, default=0), "perturbations": self.perturbations, "updates": self.updates}
         for name, value in counts.items():
             if value < 1:

@@ -269,7 +269,10 @@ class Comparison:
 
         name = f"policy_{algorithm}_{seed}_{budget}"
         path = self.stages.folder / f"{name}.safetensors"
-        settings = PolicyConfig(algorithm, calls=budget, seed=seed, fidelity=self.config.fidelity, **self.policy_settings)
+        source = self.config.hyperparameters and self.config.hyperparameters / f"{algorithm}.toml"
+        settings = PolicyConfig(
+            algorithm, calls=budget, seed=seed, fidelity=self.config.fidelity, hyperparameters=source, **self.policy_settings
+        )
 
         def work() -> Results:
             state = path.with_suffix(".training")
@@ -283,7 +286,11 @@ class Comparison:
 
         from training.algorithms import hyperparameters
 
-        content = self.base | {"config": asdict(settings), "values": hyperparameters(algorithm)}
+        # what stands in the file counts, not where it lies
+        content = self.base | {
+            "config": asdict(settings) | {"hyperparameters": None},
+            "values": hyperparameters(algorithm, source),
+        }
         self.stages.run(name, content, work, files=[path.name, path.with_suffix(".json").name])
         self._score(algorithm, seed, budget, name, lambda: {"stretches": ActorPolicy.load(path).predict(self.targets)[0]})
 
