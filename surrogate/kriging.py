@@ -23,6 +23,8 @@ from tensegrity_gym.types import Floats
 
 LENGTHS = (0.03, 0.05, 0.08, 0.12, 0.2, 0.4)  #: candidates of the length scale, in stretches
 NEIGHBOURS = 24
+#: Groups of points that are worked on together: all at once, a planner's pool of 100 000 would take 3 GB.
+BLOCK = 2048
 #: Least share of the variance that counts as noise, so that kernel matrices have inverses.
 LEAST_NOISE = 1e-4
 #: Hops that the scale is chosen on, at most.
@@ -63,15 +65,19 @@ class Kriging:
         Groups of close stretches (n, k, n_actuators) ask the neighbours of the first one, with shapes (n, k, 2) and (n, k).
         """
         groups = at.reshape(len(at), -1, at.shape[-1])
+        blocks = [self._shift(groups[first : first + BLOCK]) for first in range(0, len(groups), BLOCK)]
+        shift, share = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        return shift.reshape(*at.shape[:-1], 2), share.reshape(at.shape[:-1])
+
+    def _shift(self, groups: Floats) -> tuple[Floats, Floats]:
+        """:meth:`shift` of groups (n, k, n_actuators)."""
         count = min(NEIGHBOURS, len(self.stretches))
         near = self.tree.query(groups[:, 0], count)[1].reshape(len(groups), count)
         points = self.stretches[near]  # (n, count, n_actuators)
         kernel = self._kernel(_distances(points, points))
         seen = self._kernel(_distances(points, groups))  # (n, count, k)
         weights = np.linalg.solve(kernel + self.scale.noise * np.eye(count), seen)
-        shift = weights.swapaxes(1, 2) @ self.residuals[near]
-        share = np.clip(1 - (weights * seen).sum(axis=1), 0, 1)
-        return shift.reshape(*at.shape[:-1], 2), share.reshape(at.shape[:-1])
+        return weights.swapaxes(1, 2) @ self.residuals[near], np.clip(1 - (weights * seen).sum(axis=1), 0, 1)
 
     def _kernel(self, distance: Floats) -> Floats:
         scaled = np.sqrt(3) * distance / self.scale.length

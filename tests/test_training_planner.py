@@ -10,10 +10,11 @@ import torch
 from maps import arm, throw
 from torch import Tensor
 
+from surrogate import kriging
 from surrogate.dataset import HopData
 from surrogate.frozen import FrozenLanding
 from surrogate.generate import sample_stretches
-from surrogate.kriging import fit_kriging
+from surrogate.kriging import Kriging, Scale, fit_kriging
 from surrogate.model import HopNet, NetConfig, scene_symmetries
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
@@ -266,6 +267,20 @@ def rough_data(net: HopNet, count: int, seed: int) -> tuple[np.ndarray, np.ndarr
     wave = np.stack([np.sin(30 * images[..., 0]), np.cos(25 * images[..., 1])], axis=2)
     residual = 0.005 * (wave * net.signs[:, :2].numpy()).mean(axis=1)
     return stretches, smooth + residual, residual
+
+
+def test_kriging_says_the_same_whatever_the_size_of_its_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    images = np.array([[0, 1, 2, 3], [1, 0, 3, 2]]), np.array([[1.0, 1.0], [-1.0, 1.0]])
+    process = Kriging(rng.uniform(0.2, 0.8, (40, 4)), rng.normal(size=(40, 2)), *images, Scale(0.2, 1e-3, 1.0, 0.0))
+    for shape in ((11, 4), (11, 3, 4)):
+        at = rng.uniform(0.2, 0.8, shape)
+        whole = process.shift(at)
+        with monkeypatch.context() as patch:
+            patch.setattr(kriging, "BLOCK", 4)
+            for part, wanted in zip(process.shift(at), whole, strict=True):
+                np.testing.assert_array_equal(part, wanted)
+                assert part.shape[: len(shape) - 1] == shape[:-1]
 
 
 def test_kriging_finds_what_the_net_misses_and_knows_how_well() -> None:
