@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tensegrity_gym.errors import FileInUseError
 from training.stages import Results, Stages
 
 
@@ -66,3 +67,20 @@ def test_records_without_a_hash_of_their_results_count_as_whole_but_not_without_
     run.record.write_text(json.dumps(record))
     run()
     assert run.worked == 2
+
+
+def test_a_stage_that_another_process_works_on_is_left_to_it(tmp_path: Path) -> None:
+    stages, others = Stages(tmp_path, say=lambda _: None), Stages(tmp_path, say=lambda _: None)
+
+    def work() -> Results:
+        with pytest.raises(FileInUseError, match=r"stage\.json, but process \d+ is at it"):
+            others.run("stage", {}, lambda: {"by": "other"})
+        assert others.run("another", {}, lambda: {"by": "other"}) == {"by": "other"}
+        return {"by": "first"}
+
+    assert stages.run("stage", {}, work) == {"by": "first"}
+    assert others.run("stage", {}, lambda: {"by": "other"}) == {"by": "first"}
+    with pytest.raises(ZeroDivisionError):
+        stages.run("broken", {}, lambda: {"value": 1 / 0})
+    assert others.run("broken", {}, lambda: {"by": "other"}) == {"by": "other"}  # who fails lets go
+    assert sorted(p.name for p in (tmp_path / "stages").iterdir()) == ["another.json", "broken.json", "stage.json"]

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from surrogate.storage import ensure_folder, hash_of, read_json, write_json
+from surrogate.storage import ensure_folder, hash_of, read_json, write_json, writer_lock
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.errors import DataFileError
 
@@ -39,7 +39,8 @@ class Stages:
     ) -> Results:
         """Results of stage ``name``: from its record if that fits and all its ``files`` are there, else from ``work()``.
 
-        ``work`` returns JSON-like results; a result named "seconds" replaces the measured wall time.
+        ``work`` returns JSON-like results; a result named "seconds" replaces the measured wall time. Two processes may work
+        in one folder, on different stages: FileInUseError where another is at this one.
         """
         content = {"config": config, "needs": {n: self.hashes[n] for n in needs}, "model_version": MODEL_VERSION}
         wanted = hash_of(content)
@@ -52,13 +53,14 @@ class Stages:
             self.say(f"{name}: done before, kept")
             self.skipped.append(name)
         else:
-            started = time.perf_counter()
-            results = work()
-            seconds = results.get("seconds", time.perf_counter() - started)
-            date = datetime.now(UTC).isoformat(timespec="seconds")
-            record = {"hash": wanted, **content, "seconds": seconds, "date": date, "results": results}
-            record["results_hash"] = _results_hash(record)
-            write_json(path, record)
+            with writer_lock(path):
+                started = time.perf_counter()
+                results = work()
+                seconds = results.get("seconds", time.perf_counter() - started)
+                date = datetime.now(UTC).isoformat(timespec="seconds")
+                record = {"hash": wanted, **content, "seconds": seconds, "date": date, "results": results}
+                record["results_hash"] = _results_hash(record)
+                write_json(path, record)
             self.say(f"{name}: {seconds:.1f} s")
         self.hashes[name] = wanted
         self.seconds[name], self.dates[name] = float(record["seconds"]), record["date"]
