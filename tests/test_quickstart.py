@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tyro
 
 ROOT = Path(__file__).parent.parent
 PAGE, PLANNING, README = ROOT / "docs" / "env.md", ROOT / "docs" / "planning.md", ROOT / "README.md"
@@ -106,3 +107,28 @@ def test_the_page_on_planning_runs(asked: tuple[Path, str], monkeypatch: pytest.
     for flag in set(re.findall(r"`(--[a-z.-]+)", text)) - {"--planner.miss"}:
         fields = {*PlanCommand.__dataclass_fields__, *PolicyCommand.__dataclass_fields__}
         assert flag[2:].replace("-", "_") in fields, flag
+
+
+def commands_of(text: str) -> list[list[str]]:
+    """Commands of training and surrogate in a page, in its shell blocks or in a sentence, without those that only name one."""
+    joined = text.replace("\\\n", " ")
+    lines = [line.strip() for line in joined.splitlines() if re.match(r" *python -m", line)]
+    lines += re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", joined, flags=re.DOTALL))
+    found = [shlex.split(line.replace("$scene", "moon"), comments=True) for line in lines if "python -m" in line]
+    return [words[2:] for words in found if words[:2] == ["python", "-m"] and words[2] in ("training", "surrogate") and words[4:]]
+
+
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def test_commands_of_a_page_are_understood(page: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    for program, name, *words in commands_of(page.read_text(encoding="utf-8")):
+        module, settings = importlib.import_module(f"{program}.__main__").COMMANDS[name]
+        tyro.cli(getattr(importlib.import_module(module), settings), args=words)  # SystemExit for a flag that is not there
+
+
+def test_commands_are_found_in_pages() -> None:
+    assert len(commands_of(README.read_text(encoding="utf-8"))) >= 3
+    assert len(commands_of((ROOT / "docs" / "results.md").read_text(encoding="utf-8"))) >= 8

@@ -53,6 +53,11 @@ class Comparison:
         self.config = config
         if config.bayes:
             require_botorch()
+        if config.hyperparameters is not None:
+            from training.algorithms import hyperparameters  # stable-baselines3 takes seconds to import
+
+            for algorithm in config.algorithms:  # refused now, not after all planners
+                hyperparameters(algorithm, self._source(algorithm))
         changes = {} if config.duration is None else {"duration": config.duration}
         self.scenes = registered.scenes_of(config.scene, config.landing, **changes)
         self.scene = self.scenes.base
@@ -264,12 +269,16 @@ class Comparison:
         # the nearest stored hop is near already, and the map is rough: a wide first generation would only lose it
         return EvolutionConfig(self.config.oracle, min(8, self.config.oracle), sigma=0.01)
 
+    def _source(self, algorithm: str) -> Path | None:
+        """The file of an algorithm's hyper-parameters, None for the committed one."""
+        return self.config.hyperparameters and self.config.hyperparameters / f"{algorithm}.toml"
+
     def _policy(self, algorithm: str, seed: int, budget: int) -> None:
         from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
 
         name = f"policy_{algorithm}_{seed}_{budget}"
         path = self.stages.folder / f"{name}.safetensors"
-        source = self.config.hyperparameters and self.config.hyperparameters / f"{algorithm}.toml"
+        source = self._source(algorithm)
         settings = PolicyConfig(
             algorithm, calls=budget, seed=seed, fidelity=self.config.fidelity, hyperparameters=source, **self.policy_settings
         )
