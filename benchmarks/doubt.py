@@ -77,7 +77,13 @@ def main(config: CompareConfig) -> None:
         for name, correction in corrections(fitted.net, usual.correction, fitted.data["stretches"]).items():
             stored = fitted.data["stretches"]
             planner = InversePlanner(
-                fitted.landing, config.inverse, correction=correction, energy=usual.energy, stored=stored, seed=seed
+                fitted.landing,
+                config.inverse,
+                correction=correction,
+                energy=usual.energy,
+                stored=stored,
+                images=fitted.net.landing_images,
+                seed=seed,
             )
             landings = comparison.hops.perturbed(planner.predict(inside)[0], config.perturbations)[:, 1:]
             errors = distances(landings, inside, reach(comparison.scene)).mean(axis=1)

@@ -102,8 +102,7 @@ def fit_kriging(net: HopNet, data: HopData, validation: float, test: float, floo
     """
     stretches = data["stretches"]
     residuals = data["landing"] - net.landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy()
-    images = net.permutations.numpy(), net.signs[:, :2].numpy().astype(np.float64)
-    return fit_process(stretches, residuals, images, data.split(validation, test), floor)
+    return fit_process(stretches, residuals, net.landing_images, data.split(validation, test), floor)
 
 
 def fit_process(

@@ -178,6 +178,11 @@ class HopNet(nn.Module):
         spread = torch.sqrt(torch.nanmean((targets - self.output_mean) ** 2, dim=0))
         self.output_scale.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))
 
+    @property
+    def landing_images(self) -> tuple[np.ndarray, np.ndarray]:
+        """Symmetries under which hops have images: permutations of stretches (g, n_actuators) and signs of landings (g, 2)."""
+        return self.permutations.numpy(), self.signs[:, :2].numpy().astype(np.float64)
+
     def images(self, stretches: Tensor, scene: Tensor) -> Tensor:
         """Inputs of the net, about -1 to 1, under each symmetry: shapes (n, n_actuators) and (n, k) to (n, g, inputs)."""
         scaled = ((stretches - self.input_mean) / self.input_scale)[:, self.permutations]

@@ -186,7 +186,9 @@ def test_text_is_put_between_its_markers_alone(tmp_path: Path) -> None:
 
 
 def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path, folder: Path) -> None:
-    small = CompareConfig(out=tmp_path, progress=False, fidelity="flown", data=folder / "hops_0_0_32.h5", budgets=(8,))
+    small = CompareConfig(
+        out=tmp_path, progress=False, fidelity="flown", data=folder / "hops_0_0_32.h5", budgets=(8,), duration=0.06
+    )
     with pytest.raises(DataFileError, match="expected hops in"):
         run.Comparison(replace(small, scene="moon")).pool(0)
     with pytest.raises(DataFileError, match="at least 64"):
@@ -201,10 +203,40 @@ def test_data_of_another_scene_and_impossible_settings_are_named(tmp_path: Path,
     assert not CompareConfig(quick=True).shortened().write
 
 
+def test_hops_that_are_no_calls_of_their_own_or_were_cut_off_are_not_learnt_from(tmp_path: Path, folder: Path) -> None:
+    data, path = dataset.read(folder / "hops_0_0_32.h5"), tmp_path / "hops.h5"
+    config = CompareConfig(out=tmp_path, progress=False, fidelity="flown", data=path, budgets=(8,), duration=0.06)
+    image = np.arange(32) % 4  # three of four are images of the hop before
+    dataset.write(path, HopData(data.columns | {"image": image}, data.configuration))
+    found = run.Comparison(config).pool(0)
+    np.testing.assert_array_equal(found["stretches"], data["stretches"][image == 0])
+    with pytest.raises(DataFileError, match="at least 9 hops, got 8"):
+        run.Comparison(replace(config, budgets=(9,))).pool(0)
+    dataset.write(path, data)
+    with pytest.raises(DataFileError, match=r"expected hops in .*duration=3\.0"):  # these were followed for 0.06 s
+        run.Comparison(replace(config, duration=None)).pool(0)
+    assert len(run.Comparison(config).pool(9)) == 8
+    with pytest.raises(InvalidParameterError, match="at most 10 with a file"):  # the eleventh would learn what the first does
+        run.Comparison(config).pool(10)
+
+
+def test_what_plans_depend_on_is_in_their_record(folder: Path) -> None:
+    """Another number of looks, or of descents, and they are made again, and timed again."""
+    config = replace(CompareConfig(out=folder.parent, quick=True, progress=False).shortened(), algorithms=())
+    for changes in ({"search": 32}, {"inverse": replace(config.inverse, starts=3)}):
+        copy = folder.parent / f"changed_{next(iter(changes))}"
+        shutil.copytree(folder, copy)
+        again = run.Comparison(replace(config, out=copy, **changes))
+        again.run()
+        done = set(again.stages.results) - set(again.stages.skipped)
+        assert {"plans_0_16", "score_cma_0_16", "refine2_1_32", "latency"} <= done
+        assert not [name for name in done if name.startswith(("net", "hops", "floor"))]
+
+
 def test_data_of_another_physics_are_refused(tmp_path: Path, folder: Path) -> None:
     """What planners learn from must be made as their answers are scored."""
     data, path = dataset.read(folder / "hops_0_0_32.h5"), tmp_path / "hops.h5"
-    config = CompareConfig(out=tmp_path, progress=False, fidelity="flown", data=path, budgets=(8,))
+    config = CompareConfig(out=tmp_path, progress=False, fidelity="flown", data=path, budgets=(8,), duration=0.06)
 
     def pool(asked: str = "flown", **changes: object) -> HopData:
         dataset.write(path, HopData(data.columns, data.configuration | changes))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from maps import arm, throw
+from scipy.optimize import minimize
 from torch import Tensor
 
 from surrogate import kriging
@@ -18,6 +19,7 @@ from surrogate.kriging import Kriging, Scale, fit_kriging
 from surrogate.model import HopNet, NetConfig, scene_symmetries
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from training import refine
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.inverse import InverseConfig, InversePlanner, fit_energy
 from training.planner import BestOfPlanner, NearestHopPlanner, targets_of
@@ -359,6 +361,84 @@ def test_hops_in_turn_respect_the_range_and_survive_failures() -> None:
     # nothing ever flies: the first plan is the answer
     lost = RefiningPlanner(planner, lambda s: np.full((len(s), 2), np.nan), 3)
     np.testing.assert_array_equal(lost.predict(targets)[0], planner.plan(targets).stretches)
+
+
+def test_steps_are_the_shortest_that_stay_in_range_and_do_what_is_wanted() -> None:
+    rng = np.random.default_rng(0)
+    checked = 0
+    for _ in range(100):
+        at = rng.uniform(0.2, 0.8, 4)
+        at[rng.integers(4)] = rng.choice([0.2, 0.8, 0.79, 0.205])
+        slope, wanted = rng.normal(0, 0.3, (2, 4)), rng.normal(0, 0.008, 2)
+        step = refine._step(at[None], slope[None], wanted[None])[0]
+        assert ((at + step >= 0.2 - 1e-12) & (at + step <= 0.8 + 1e-12)).all()
+        assert np.abs(step).max() <= refine.LONGEST_STEP + 1e-12
+        known = minimize(
+            lambda s: s @ s,
+            np.zeros(4),
+            jac=lambda s: 2 * s,
+            constraints={"type": "eq", "fun": lambda s: slope @ s - wanted, "jac": lambda s: slope},  # noqa: B023
+            bounds=list(zip(0.2 - at, 0.8 - at, strict=True)),
+            method="SLSQP",
+            options={"ftol": 1e-14, "maxiter": 300},
+        )
+        if known.success and np.abs(known.x).max() < 0.9 * refine.LONGEST_STEP and np.abs(step).max() < refine.LONGEST_STEP:
+            np.testing.assert_allclose(slope @ step, wanted, atol=1e-9)
+            assert np.linalg.norm(step) <= 1.02 * np.linalg.norm(known.x) + 1e-9
+            checked += 1
+    assert checked > 50
+
+
+def test_hops_in_turn_do_not_get_stuck_near_the_end_of_the_range() -> None:
+    """A step cut off at the end of the range landed elsewhere than wanted, taught nothing, and was taken again and again."""
+    slope = np.array([[0.13, -0.13, -0.13, 0.13], [0.016, 0.016, -0.016, -0.016]])
+
+    def real(stretches: np.ndarray) -> np.ndarray:
+        return (stretches - 0.5) @ slope.T
+
+    class Near:
+        def predict(self, targets: np.ndarray) -> tuple[np.ndarray, None]:
+            return np.array([[0.6965, 0.7963, 0.3882, 0.6688]]), None
+
+        def slope(self, stretches: np.ndarray) -> np.ndarray:
+            return slope[None]
+
+    target = np.array([[0.0215, 0.0080]])
+    assert RefiningPlanner(Near(), real, 1).refine(target).errors > 1e-3
+    assert RefiningPlanner(Near(), real, 3).refine(target).errors < 1e-9
+
+
+def test_nearest_hop_counts_images_and_leaves_out_hops_without_a_landing() -> None:
+    images = np.array([[0, 1, 2, 3], [2, 3, 0, 1]]), np.array([[1.0, 1.0], [-1.0, -1.0]])
+    stretches = np.array([(0.2, 0.3, 0.4, 0.5), (0.6, 0.6, 0.6, 0.7), (0.5, 0.5, 0.5, 0.5)])
+    landings = np.array([(0.1, 0.0), (0.0, 0.2), (np.nan, np.nan)])
+    planner = NearestHopPlanner(stretches, landings, images=images)
+    targets = np.array([(0.09, 0.0), (-0.09, 0.01), (0.0, -0.19)])
+    expected = [(0.2, 0.3, 0.4, 0.5), (0.4, 0.5, 0.2, 0.3), (0.6, 0.7, 0.6, 0.6)]
+    np.testing.assert_array_equal(planner.predict(targets)[0], expected)
+    # of another scene, and so dearer than a farther one
+    strange = NearestHopPlanner(stretches, landings, images=images, strangeness=np.array([1.0, 0.0, 0.0]))
+    image = (0.6, 0.7, 0.6, 0.6)
+    np.testing.assert_array_equal(strange.predict(targets)[0], [stretches[1], stretches[1], image])
+    for broken in (stretches[:2], stretches[:0]):
+        with pytest.raises(InvalidParameterError, match="at least one of them finite"):
+            NearestHopPlanner(broken, np.full((3, 2), np.nan)[: len(broken) + 1])
+    with pytest.raises(InvalidParameterError, match="at least one of them finite"):
+        NearestHopPlanner(stretches, np.full((3, 2), np.nan))
+    with pytest.raises(InvalidParameterError, match="at least one"):
+        planner.predict(np.empty((0, 2)))
+
+
+def test_inverse_starts_from_images_and_sees_of_them_what_it_would() -> None:
+    net = small_net()
+    stored = np.random.default_rng(1).uniform(0.2, 0.8, (30, 4))
+    alone = InversePlanner(net.landing, InverseConfig(pool=16), stored=stored)
+    planner = InversePlanner(net.landing, InverseConfig(pool=16), stored=stored, images=net.landing_images)
+    assert len(planner.pool) == 4 * len(alone.pool) == 4 * 46
+    mean, variance = planner.see(planner.pool)
+    torch.testing.assert_close(planner.pool_seen[0], mean, rtol=0, atol=1e-6)
+    torch.testing.assert_close(planner.pool_seen[1], variance, rtol=1e-3, atol=1e-9)
+    assert {tuple(row) for row in alone.pool.tolist()} < {tuple(row) for row in planner.pool.tolist()}
 
 
 def test_stored_hops_know_a_slope_that_hops_in_turn_can_follow() -> None:

@@ -164,10 +164,15 @@ def _plans(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, held
             scale = None if correction is None else asdict(correction.scale)
             plans["correction"][str(budget)] = {"scale": scale, "seconds": time.perf_counter() - started}
             inverse = InversePlanner(
-                net.landing, config.planner, correction=correction, stored=known["stretches"], seed=config.seed
+                net.landing,
+                config.planner,
+                correction=correction,
+                stored=known["stretches"],
+                images=net.landing_images,
+                seed=config.seed,
             )
             planners: dict[str, Planner] = {
-                "nearest": NearestHopPlanner(known["stretches"], known["landing"]),
+                "nearest": NearestHopPlanner(known["stretches"], known["landing"], images=net.landing_images),
                 "planner": inverse,
             }
             if budget == config.hops:
@@ -178,7 +183,7 @@ def _plans(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, held
                 plans[method][str(budget)] = {"stretches": stretches.tolist(), "seconds": time.perf_counter() - started}
         return plans
 
-    settings = {"planner": asdict(config.planner), "turns": TURNS, "seed": config.seed, "scene": asdict(scene)}
+    settings = {"planner": asdict(config.planner), "turns": TURNS, "seed": config.seed, "scene": asdict(scene), "images": True}
     stages.run("plans", settings, work, needs=[f"surrogate_{b}" for b in budgets])
 
 

@@ -14,7 +14,7 @@ from surrogate.generate import sample_stretches
 from surrogate.model import one_thread
 from tensegrity_gym import STRETCH_RANGE
 from tensegrity_gym.errors import InvalidParameterError
-from training.planner import Prediction, targets_of
+from training.planner import Images, Prediction, targets_of
 
 #: Added to the variance under the root, so that its derivative exists where it is zero [m^2].
 LEAST_VARIANCE = 1e-10
@@ -74,6 +74,7 @@ class InversePlanner:
             groups of close stretches (n, k, n_actuators) to (n, k, 2) and (n, k).
         energy: stretches to the energy that they store, shape (n,) [J]: chooses among equals.
         stored: stretches to start from besides the spread-out ones, shape (m, n_actuators).
+        images: symmetries that ``landing`` and ``correction`` have: it starts from the images of all these as well.
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class InversePlanner:
         correction: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
         energy: Callable[[np.ndarray], np.ndarray] | None = None,
         stored: np.ndarray | None = None,
+        images: Images | None = None,
         n_actuators: int = 4,
         seed: int = 0,
     ) -> None:
@@ -93,6 +95,11 @@ class InversePlanner:
         self.pool = torch.from_numpy((pool if stored is None else np.concatenate([pool, stored])).astype(np.float32))
         with torch.no_grad():
             self.pool_seen = self.see(self.pool)
+        if images is not None:  # what is seen of an image is the image of what is seen
+            permutations, signs = (torch.from_numpy(np.asarray(a)) for a in images)
+            mean, variance = self.pool_seen
+            self.pool = self.pool[:, permutations].reshape(-1, n_actuators)
+            self.pool_seen = (mean[:, None] * signs.to(mean)).reshape(-1, 2), variance.repeat_interleave(len(permutations))
         self.scale = float((self.pool_seen[0] ** 2).sum(dim=1).quantile(0.95)) or 1.0  # squared reach [m^2]
 
     def predict(

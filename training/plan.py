@@ -88,7 +88,12 @@ def planner_of(
     if not len(known):
         raise InvalidParameterError(f"{where}: expected at least one hop that did not fail, got none of {len(data)}")
     stretches, energy = known["stretches"], fit_energy(known["stretches"], known["stored_energy"])
-    of_all: dict[str, Any] = {"energy": energy, "n_actuators": stretches.shape[1], "seed": seed + START_SEED}
+    of_all: dict[str, Any] = {
+        "energy": energy,
+        "images": net.landing_images,
+        "n_actuators": stretches.shape[1],
+        "seed": seed + START_SEED,
+    }
     if not at:
         kriging = fit_kriging(net, known, held, 0.0, floor)
         return InversePlanner(FrozenLanding(net), config, correction=kriging, stored=stretches, **of_all)

@@ -20,6 +20,8 @@ NEIGHBOURS = 24
 #: Stretches, shape (n, n_actuators), to where their hops land, shape (n, 2) [m]; not-a-number where a hop failed.
 Land = Callable[[np.ndarray], np.ndarray]
 Prediction = tuple[np.ndarray, Any]
+#: Symmetries under which hops have images: permutations of stretches (g, n_actuators) and signs of landings (g, 2).
+Images = tuple[np.ndarray, np.ndarray]
 
 
 class Planner(Protocol):
@@ -43,58 +45,73 @@ class SlopedPlanner(Planner, Protocol):
 def targets_of(observation: np.ndarray) -> np.ndarray:
     """The targets in one observation or a batch of them, shape (n, 2) [m]; InvalidParameterError if they are none."""
     targets = np.atleast_2d(np.asarray(observation, dtype=np.float64))
-    if targets.ndim != 2 or targets.shape[1] < 2 or not np.isfinite(targets).all():
-        raise InvalidParameterError(f"observation: expected finite targets (2,) or (n, 2) [m], got {observation!r}")
+    if targets.ndim != 2 or targets.shape[1] < 2 or not len(targets) or not np.isfinite(targets).all():
+        raise InvalidParameterError(f"observation: expected finite targets (2,) or (n, 2) [m], at least one, got {observation!r}")
     return targets[:, :2]
+
+
+def with_images(stretches: np.ndarray, landings: np.ndarray, images: Images | None) -> tuple[np.ndarray, np.ndarray]:
+    """Hops, stretches (n, n_actuators) and landings (n, 2) [m], with their images, (g n, n_actuators) and (g n, 2) [m]."""
+    if images is None:
+        return stretches, landings
+    permutations, signs = images
+    return stretches[:, permutations].reshape(-1, stretches.shape[1]), (landings[:, None] * signs).reshape(-1, 2)
 
 
 class NearestHopPlanner:
     """Repeat the stored hop that landed nearest to the target: the baseline that every other planner must beat.
 
-    ``strangeness``: squared error to expect of each stored hop for its being of another scene, shape (m,) [m^2]. ``images``:
-    symmetries under which hops have images, permutations (g, n_actuators) and signs (g, 2).
+    Args:
+        stretches: of the stored hops, shape (m, n_actuators).
+        landings: where they landed, shape (m, 2) [m]; hops whose landing is not a number are left out.
+        images: symmetries of lattice and ground: a hop's image under each counts as stored too, for it needs no simulating.
+        strangeness: squared error to expect of each hop for its being of another scene, shape (m,) [m^2].
     """
 
     def __init__(
         self,
         stretches: np.ndarray,
         landings: np.ndarray,
+        *,
+        images: Images | None = None,
         strangeness: np.ndarray | None = None,
-        images: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        if len(stretches) == 0 or len(stretches) != len(landings):
+        stretches, landings = np.asarray(stretches, dtype=np.float64), np.asarray(landings, dtype=np.float64)
+        known = np.isfinite(landings).all(axis=1) if landings.ndim == 2 else np.zeros(0, dtype=bool)
+        if len(stretches) != len(landings) or not known.any():
             raise InvalidParameterError(
-                f"expected as many stretches as landings, at least one, got {len(stretches)} and {len(landings)}"
+                f"expected as many stretches as landings, at least one of them finite, got {len(stretches)} and {len(landings)}, "
+                f"{known.sum()} finite"
             )
-        self.stretches = np.asarray(stretches, dtype=np.float64)
-        self.landings = np.asarray(landings, dtype=np.float64)
-        self.strangeness = strangeness
-        n_actuators = self.stretches.shape[1]
-        self.images = (np.arange(n_actuators)[None], np.ones((1, 2))) if images is None else images
+        #: All images of the stored hops: stretches (g m, n_actuators) and where they land (g m, 2) [m].
+        self.stretches, self.landings = with_images(stretches[known], landings[known], images)
+        self.strangeness = None if strangeness is None else np.repeat(strangeness[known], len(self.stretches) // known.sum())
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Prediction:
         """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4)."""
-        distance = np.linalg.norm(targets_of(observation)[:, None] - self.landings, axis=2)
-        if self.strangeness is not None:
-            distance = distance**2 + self.strangeness
-        chosen = self.stretches[distance.argmin(axis=1)]
+        targets = targets_of(observation)
+        if self.strangeness is None:
+            nearest = self._landed.query(targets)[1]
+        else:  # one target at a time: all at once would take targets x hops numbers
+            nearest = np.array([(((self.landings - t) ** 2).sum(axis=1) + self.strangeness).argmin() for t in targets])
+        chosen = self.stretches[nearest]
         return (chosen[0] if np.ndim(observation) == 1 else chosen), state
 
     @cached_property
-    def _known(self) -> tuple[KDTree, np.ndarray]:
-        """All images of the stored hops: a tree of their stretches, and where they landed, shape (g m, 2) [m]."""
-        permutations, signs = self.images
-        seen = self.stretches[:, permutations].reshape(-1, self.stretches.shape[1])
-        return KDTree(seen), (self.landings[:, None] * signs).reshape(-1, 2)
+    def _landed(self) -> KDTree:
+        return KDTree(self.landings)
+
+    @cached_property
+    def _tried(self) -> KDTree:
+        return KDTree(self.stretches)
 
     def slope(self, stretches: np.ndarray) -> np.ndarray:
         """Of the plane fitted to the landings of the nearest stored hops and their images; see ``SlopedPlanner``."""
-        tree, landed = self._known
-        near = tree.query(stretches, min(NEIGHBOURS, tree.n))[1].reshape(len(stretches), -1)
-        away = tree.data[near] - np.asarray(stretches)[:, None]
-        plane = np.linalg.pinv(np.concatenate([np.ones((*near.shape, 1)), away], axis=2)) @ landed[near]
+        near = self._tried.query(stretches, min(NEIGHBOURS, self._tried.n))[1].reshape(len(stretches), -1)
+        away = self.stretches[near] - np.asarray(stretches)[:, None]
+        plane = np.linalg.pinv(np.concatenate([np.ones((*near.shape, 1)), away], axis=2)) @ self.landings[near]
         return plane[:, 1:].swapaxes(1, 2)
 
 

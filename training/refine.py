@@ -80,15 +80,28 @@ def _updated(slope: Floats, moved: Floats, came: Floats) -> Floats:
 def _step(at: Floats, slope: Floats, wanted: Floats) -> Floats:
     """Least-norm steps (n, n_actuators) that move landings by ``wanted`` (n, 2) [m], where the range of stretches lets them.
 
-    Stretches at an end of their range that would leave it are held, and the others do their part.
+    Stretches that would leave their range go to its end, and the others do the rest: a step cut off there would land elsewhere
+    than the slope says, teach nothing, and be tried again.
     """
     low, high = STRETCH_RANGE
-    free = np.ones(at.shape, dtype=bool)
+    step = _least_norm(slope, wanted)
+    share = _shortening(step)
+    step, wanted = step * share, wanted * share
+    free, held = np.ones(at.shape, dtype=bool), np.zeros(at.shape)
     for _ in range(at.shape[1]):
-        step = (np.linalg.pinv(slope * free[:, None], rcond=1e-3) @ wanted[..., None])[..., 0]
-        leaving = free & (((at <= low) & (step < 0)) | ((at >= high) & (step > 0)))
+        leaving = free & ((at + step < low) | (at + step > high))
         if not leaving.any():
             break
+        held = np.where(leaving, np.clip(at + step, low, high) - at, held)
         free &= ~leaving
-    longest = np.abs(step).max(axis=1, keepdims=True)
-    return step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))
+        step = held + free * _least_norm(slope * free[:, None], wanted - (slope @ held[..., None])[..., 0])
+    return step * _shortening(step)
+
+
+def _least_norm(slope: Floats, wanted: Floats) -> Floats:
+    return (np.linalg.pinv(slope, rcond=1e-3) @ wanted[..., None])[..., 0]
+
+
+def _shortening(step: Floats) -> Floats:
+    """What steps are multiplied by to be no longer than ``LONGEST_STEP`` in any stretch, shape (n, 1)."""
+    return np.minimum(1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))

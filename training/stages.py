@@ -54,6 +54,7 @@ class Stages:
             self.skipped.append(name)
         else:
             with writer_lock(path):
+                path.unlink(missing_ok=True)  # from now on the stage's files may be others than the record tells of
                 started = time.perf_counter()
                 results = work()
                 seconds = results.get("seconds", time.perf_counter() - started)

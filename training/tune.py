@@ -18,7 +18,7 @@ from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.task import check_fidelity, reach, sample_targets
 from training.algorithms import FOLDER, hyperparameters
 from training.compare.statistics import interquartile_mean
-from training.compare.targets import scenes_of
+from training.compare.targets import SCENES, VARIED, scenes_of
 from training.hops import Hops
 from training.score import distances
 from training.stages import Results, Stages
@@ -63,6 +63,8 @@ class TuneConfig:
         for name in ("settings", "seeds", "finalists", "final_seeds", "targets"):
             if getattr(self, name) < 1:
                 raise InvalidParameterError(f"{name}: expected an integer >= 1, got {getattr(self, name)}")
+        if self.scene in VARIED:
+            raise InvalidParameterError(f"scene: expected one of {SCENES}, got {self.scene!r}, whose scenes vary; choose another")
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ class Search:
         return Trial(number, self.values[number], [self._error(number, seed) for seed in seeds])
 
     def _error(self, number: int, seed: int) -> float:
-        config, values, name = self.config, self.values[number], f"trial_{number}_{seed}"
+        config, values, name = self.config, self.values[number], f"trial_{self.config.algorithm}_{number}_{seed}"
         path = self.stages.folder / f"{config.algorithm}_{number}.toml"
 
         def work() -> Results:

@@ -21,7 +21,7 @@ from surrogate.model import HopNet, one_thread
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.planner import NearestHopPlanner, Planner, Prediction
+from training.planner import Images, NearestHopPlanner, Planner, Prediction, with_images
 from training.similarity import alike
 
 #: Neighbours of each hop that tell how its landing changes with stretches and scene.
@@ -149,17 +149,22 @@ class NearestVariedHops:
         stretches: shape (n, n_actuators).
         landings: as they would be on Earth, shape (n, 2) [m].
         values: of each hop's scene, shape (n, k) [SI].
+        images: symmetries under which hops have images, in all of the scenes.
     """
 
-    def __init__(self, stretches: Floats, landings: Floats, values: Floats, scenes: SceneRanges) -> None:
-        self.stretches, self.landings, self.scenes = stretches, landings, scenes
-        self.values = unit_values(values, scenes)
-        self.weights = variogram(stretches, landings, self.values)[1]
+    def __init__(
+        self, stretches: Floats, landings: Floats, values: Floats, scenes: SceneRanges, *, images: Images | None = None
+    ) -> None:
+        self.scenes = scenes
+        values = unit_values(values, scenes)
+        self.weights = variogram(stretches, landings, values)[1]
+        self.stretches, self.landings = with_images(stretches, landings, images)
+        self.values = np.repeat(values, len(self.stretches) // len(stretches), axis=0)
 
     def at(self, values: Floats) -> NearestHopPlanner:
         """The planner of one scene, of ``values`` (k,) [SI]."""
         away = (self.values - unit_values(values[None], self.scenes)) ** 2
-        return NearestHopPlanner(self.stretches, self.landings, away @ self.weights)
+        return NearestHopPlanner(self.stretches, self.landings, strangeness=away @ self.weights)
 
 
 class VariedKriging:

@@ -22,7 +22,7 @@ from surrogate.model import HopNet
 from surrogate.train import train
 from tensegrity_gym import Design, Lattice, Scene
 from tensegrity_gym.auto import choose_fidelity
-from tensegrity_gym.errors import DataFileError
+from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.fidelity import FIDELITIES, Fidelity, named_fidelity
 from tensegrity_gym.scene_ranges import SceneRanges
 from training.compare.config import CompareConfig
@@ -52,12 +52,19 @@ def from_file(path: Path, scenes: SceneRanges, fidelity: str, seed: int, most: i
 
     They must be hops of the model that ``fidelity`` names: answers are scored with it.
     """
+    if seed >= PARTS:
+        raise InvalidParameterError(
+            f"seeds: expected at most {PARTS} with a file of hops, of which each begins at another tenth, got seed {seed}; "
+            "ask for fewer, or leave --data out"
+        )
     data, scene = dataset.read(path), scenes.base
+    data = data.rows(data["image"] == 0)  # images of simulated hops are no simulator calls
     _check_physics(data.configuration, scene, fidelity, path)
     kept, ranges = Scene(**data.configuration["scene"]), data.configuration["scene_ranges"]
     same = replace(kept, landing=scene.landing, duration=scene.duration, **{n: getattr(scene, n) for n in scenes.observed})
     wanted = {name: list(bounds) for name, bounds in scenes.ranges.items()}
-    if same != scene or ranges != wanted or (wanted and kept.duration < scene.duration):
+    # a file of shorter hops has some that were cut off in flight
+    if same != scene or ranges != wanted or kept.duration < scene.duration:
         raise DataFileError(
             f"{path}: expected hops in {scene}{_and(wanted)}, got hops in {kept}{_and(ranges)}; use another file, or none"
         )
@@ -110,9 +117,14 @@ class Fitted:
         if name not in self._made:
             started = time.perf_counter()
             make: dict[str, Callable[[], Planner]] = {
-                "nearest": lambda: NearestHopPlanner(self.data["stretches"], self.data["landing"], images=self.images),
+                "nearest": lambda: NearestHopPlanner(
+                    self.data["stretches"], self.data["landing"], images=self.net.landing_images
+                ),
                 "single": lambda: InversePlanner(
-                    FrozenLanding(self.net.member(0)), self.config.inverse, stored=self.data["stretches"]
+                    FrozenLanding(self.net.member(0)),
+                    self.config.inverse,
+                    stored=self.data["stretches"],
+                    images=self.net.landing_images,
                 ),
                 "ensemble": lambda: self.inverse,
                 "tandem": self._tandem,
@@ -132,13 +144,9 @@ class Fitted:
             correction=fit_kriging(self.net, self.data, *shares, self.floor),
             energy=fit_energy(stretches, self.data["stored_energy"]),
             stored=stretches,
+            images=self.net.landing_images,
             seed=self.seed,
         )
-
-    @property
-    def images(self) -> tuple[np.ndarray, np.ndarray]:
-        """Symmetries that hops have images under: permutations (g, n_actuators) and signs (g, 2)."""
-        return self.net.permutations.numpy(), self.net.signs[:, :2].numpy()
 
     def _tandem(self) -> TandemPlanner:
         def see(stretches: Tensor) -> tuple[Tensor, Tensor]:
@@ -146,13 +154,9 @@ class Fitted:
             mean = landings.mean(dim=0)
             return mean, ((landings - mean) ** 2).sum(dim=-1).mean(dim=0)
 
-        return TandemPlanner(
-            see,
-            self.data["landing"],
-            replace(self.config.tandem, seed=self.seed),
-            permutations=self.images[0],
-            signs=self.images[1],
-        )
+        permutations, signs = self.net.landing_images
+        settings = replace(self.config.tandem, seed=self.seed)
+        return TandemPlanner(see, self.data["landing"], settings, permutations=permutations, signs=signs)
 
     def _evolution(self) -> EvolutionPlanner:
         search = EvolutionConfig(evaluations=self.config.search, seed=self.seed)

@@ -23,7 +23,7 @@ from training.compare.config import CompareConfig
 from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, model_of, simulated
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.hops import Hops
-from training.planner import BestOfPlanner, NearestHopPlanner, Planner
+from training.planner import BestOfPlanner, Planner
 from training.policies import ActorPolicy
 from training.refine import RefiningPlanner
 from training.stages import Results, Stages
@@ -89,7 +89,8 @@ class Comparison:
         for seed, budget in config.planner_runs:
             self._planners(seed, budget)
             if config.tries_seeds is None or seed < config.tries_seeds:
-                self._best_of(seed, budget)
+                for tries in config.tries:
+                    self._best_of(tries, seed, budget)
             for tries in config.refine:
                 for start in self.starts:
                     self._refined(start, tries, seed, budget)
@@ -171,17 +172,29 @@ class Comparison:
             return {"seconds": card["seconds"]}
 
         settings = {"surrogate": asdict(config.surrogate), "updates": config.updates}
-        self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{tag}"], files=[path.name])
+        files = [path.name, path.with_suffix(".json").name]
+        self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{tag}"], files=files)
 
         def plan() -> Results:
             fitted = self.fitted(seed, budget)
             answers = {name: fitted[name].predict(self.targets)[0].tolist() for name in self.names}
             return {name: {"stretches": answers[name], "seconds": fitted.seconds[name]} for name in self.names}
 
-        settings = {"inverse": asdict(config.inverse), "tandem": asdict(config.tandem), "planners": self.names}
+        settings = self._planning | {"planners": self.names}
         self.stages.run(f"plans_{tag}", settings | {"targets": self.targets.tolist()}, plan, needs=[f"net_{tag}", "floor"])
         for name in self.names:
             self._score(name, seed, budget, f"plans_{tag}", partial(self._kept, f"plans_{tag}", name))
+
+    @property
+    def _planning(self) -> dict[str, Any]:
+        """What plans depend on besides nets and targets."""
+        config = self.config
+        return {
+            "inverse": asdict(config.inverse),
+            "tandem": asdict(config.tandem),
+            "search": config.search,
+            "images": True,  # of stored hops, which planners did without before
+        }
 
     def _kept(self, stage: str, name: str) -> Results:
         return self.stages.results[stage][name]
@@ -191,29 +204,12 @@ class Comparison:
         """Planners that can run here."""
         return [name for name in PLANNERS if name != "cma" or find_spec("cma")]
 
-    def _best_of(self, seed: int, budget: int) -> None:
-        tag = f"{seed}_{budget}"
-        if not self.config.tries:
-            return
-
-        def work() -> Results:
-            most = max(self.config.tries)
-            proposed = self.fitted(seed, budget).inverse.propose(self.targets, most)
-            landings = self.hops.land(proposed.reshape(-1, proposed.shape[2]), np.repeat(self.targets, most, axis=0))
-            errors = np.linalg.norm(landings.reshape(*proposed.shape[:2], 2) - self.targets[:, None, :2], axis=2)
-            errors = np.where(np.isfinite(errors), errors, np.inf)
-            return {
-                str(tries): {"stretches": proposed[np.arange(len(proposed)), errors[:, :tries].argmin(axis=1)].tolist()}
-                for tries in self.config.tries
-            }
-
-        self.stages.run(f"best_{tag}", {"tries": self.config.tries}, work, needs=[f"plans_{tag}"])
-        for tries in self.config.tries:
-            self._score(f"best{tries}", seed, budget, f"best_{tag}", partial(self._kept, f"best_{tag}", str(tries)))
+    def _best_of(self, tries: int, seed: int, budget: int) -> None:
+        self._tried(f"best{tries}", f"best{tries}", {"tries": tries}, lambda fitted: self._best(fitted, tries), seed, budget)
 
     def _refined(self, start: str, tries: int, seed: int, budget: int) -> None:
         method = f"{REFINED[start]}{tries}"
-        settings = {"tries": tries, "method": "secant"}
+        settings = {"tries": tries, "method": "secant, stretches held at the ends of their range"}
         self._tried(method, method, settings, lambda fitted: self._refining(fitted, start, tries), seed, budget)
 
     def _bayesian(self, seed: int, budget: int) -> None:
@@ -248,20 +244,18 @@ class Comparison:
             return
 
         budget = max(self.config.budgets)
-        data = self.learnt(0, budget)
 
         def work() -> Results:
             before = self.hops.calls
-            stretches, _ = self._search_of(data).predict(self.targets)
+            stretches, _ = self._search_from(self.fitted(0, budget)["nearest"]).predict(self.targets)
             return {"stretches": stretches.tolist(), "calls_per_answer": (self.hops.calls - before) / len(self.targets)}
 
-        settings = {"search": asdict(self._search), "targets": self.targets.tolist()}
-        self.stages.run("oracle", settings, work, needs=[f"hops_0_{budget}"])
+        settings = {"search": asdict(self._search), "targets": self.targets.tolist(), "images": True}
+        self.stages.run("oracle", settings, work, needs=[f"net_0_{budget}"])
         self._score("oracle", 0, budget, "oracle", lambda: self.stages.results["oracle"])
 
-    def _search_of(self, data: HopData) -> Planner:
-        """CMA-ES on the simulator, from the nearest of the hops in ``data``."""
-        start = NearestHopPlanner(data["stretches"][data.usable], data["landing"][data.usable])
+    def _search_from(self, start: Planner) -> Planner:
+        """CMA-ES on the simulator."""
         return EvolutionPlanner(self.hops.land, start, self._search)
 
     @property
@@ -327,7 +321,7 @@ class Comparison:
             return {name: self._questions(planner, name) for name, planner in asked.items()}
 
         needs = [f"net_0_{budget}", *policies.values()]
-        content = {"questions": self.config.latencies, "tries": self.config.tries, "refine": self.config.refine}
+        content = {"questions": self.config.latencies, "tries": self.config.tries, "refine": self.config.refine} | self._planning
         how = {"threads": 1}  # of torch; times from before, with all, are measured again
         self.stages.run("latency", content | how, work, needs=needs)
         if self.config.bayes and self.config.bayes_seeds != 0:  # apart, so that the others' times stay as they were

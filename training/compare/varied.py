@@ -118,15 +118,8 @@ class VariedComparison(Comparison):
         assert start == "ensemble"
         return VariedPlanner(lambda values: RefiningPlanner(fitted.planner(values), self._land_at(values), tries), self.scenes)
 
-    def _search_of(self, data: HopData) -> Planner:
-        hops = stored(data.rows(data.usable), self)
-        return VariedEvolution(self.land, VariedPlanner(hops.at, self.scenes), self._search, self.scenes)
-
-
-def stored(data: HopData, comparison: VariedComparison) -> NearestVariedHops:
-    """The hops of ``data``, to be repeated in other scenes."""
-    scenes = comparison.scenes
-    return NearestVariedHops(data["stretches"], data["landing"], scene_values(data, scenes), scenes)
+    def _search_from(self, start: Planner) -> Planner:
+        return VariedEvolution(self.land, start, self._search, self.scenes)
 
 
 class VariedFitted:
@@ -147,7 +140,7 @@ class VariedFitted:
         if name not in self._made:
             started = time.perf_counter()
             make: dict[str, Callable[[], Planner]] = {
-                "nearest": lambda: VariedPlanner(stored(self.data, self.comparison).at, self.scenes),
+                "nearest": lambda: VariedPlanner(self._stored().at, self.scenes),
                 "single": lambda: VariedPlanner(self._of_one_net, self.scenes),
                 "ensemble": lambda: VariedPlanner(self.planner, self.scenes),
                 "tandem": self._tandem,
@@ -156,6 +149,12 @@ class VariedFitted:
             self._made[name] = make[name]()
             self.seconds[name] = time.perf_counter() - started
         return self._made[name]
+
+    def _stored(self) -> NearestVariedHops:
+        data, scenes = self.data, self.scenes
+        return NearestVariedHops(
+            data["stretches"], data["landing"], scene_values(data, scenes), scenes, images=self.net.landing_images
+        )
 
     @property
     def inverse(self) -> VariedPlanner:
@@ -166,14 +165,15 @@ class VariedFitted:
     def planner(self, values: Floats) -> InversePlanner:
         """The robust planner of one scene, of ``values`` (k,) [SI]."""
         settings = replace(self.config.inverse, starts=max(VARIED_STARTS, self.config.inverse.starts))
-        planner = InversePlanner(self.landing.at(values), settings, energy=self.energy, seed=self.seed)
+        images = self.net.landing_images
+        planner = InversePlanner(self.landing.at(values), settings, energy=self.energy, images=images, seed=self.seed)
         if self.kriging is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
             planner.correction = self.kriging.at(values)
         return planner
 
     @one_thread()
     def _of_one_net(self, values: Floats) -> InversePlanner:
-        return InversePlanner(self._first.at(values), self.config.inverse)
+        return InversePlanner(self._first.at(values), self.config.inverse, images=self.net.landing_images)
 
     @cached_property
     def _first(self) -> FrozenLanding:
@@ -192,8 +192,8 @@ class VariedFitted:
             see,
             self.data["landing"],
             replace(self.config.tandem, seed=self.seed),
-            permutations=self.net.permutations.numpy(),
-            signs=self.net.signs[:, :2].numpy(),
+            permutations=self.net.landing_images[0],
+            signs=self.net.landing_images[1],
             scene_values=len(self.scenes.observed),
         )
         return ScaledScenes(tandem, self.scenes)
