@@ -128,8 +128,9 @@ def fill(
     """Make ``path`` hold hops ``first`` to ``first + hops`` of the configuration, and simulate what it lacks.
 
     Each chunk is committed as a file of its own under ``<path>.parts``, by a rename; the parts are joined, and removed, when
-    all are there. Killed at any moment, nothing is lost but the chunks at work. A chunk that fails ``retries`` + 1 times is
-    left out: the others are joined, and SkippedChunksError names it; a rerun tries it again.
+    all that were asked for are there; those that a larger run left behind are joined too. Killed at any moment, nothing is lost
+    but the chunks at work. A chunk that fails ``retries`` + 1 times is left out: the others are joined, and SkippedChunksError
+    names it; a rerun tries it again.
     """
     path = Path(path)
     _check(hops, first, chunk, configuration, stretches)
@@ -151,7 +152,7 @@ def fill(
                 else:
                     outcomes = run_on_cluster(tasks, work, scheduler, workers, retries, bar.update)
                 have += _commit_all(folder, outcomes, configuration, skipped, bar)
-        if have and (lacking or not path.exists()):
+        if have and (lacking or len(have) > len(known)):  # parts may be there, of a larger run, where none is lacking
             dataset.write_blocks(path, configuration.as_dict(), join(have), skipped)
         shutil.rmtree(folder, ignore_errors=True)
     if skipped:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -127,6 +128,32 @@ def test_rerun_with_other_chunks_fills_the_gaps_only(tmp_path: Path, monkeypatch
 
 
 _simulate = chunks.simulate
+
+
+def test_a_smaller_run_keeps_the_chunks_of_a_larger_one_that_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "hops.h5"
+    generate.fill(path, 4, CONFIGURATION, chunk=4, progress=False)
+
+    def killed(task: chunks.Task, **options: Any) -> dataset.HopData:
+        if task.first == 12:
+            raise KeyboardInterrupt
+        return chunks.run_chunk(task, **options)
+
+    with pytest.raises(KeyboardInterrupt):
+        generate.fill(path, 20, CONFIGURATION, chunk=4, progress=False, work=killed)
+    assert len(list(tmp_path.glob("hops.h5.parts/*.h5"))) == 2
+    small = generate.generate(path, 4, CONFIGURATION, chunk=4, progress=False)  # which the file had already
+    assert small["index"].tolist() == [0, 1, 2, 3]
+    assert dataset.read(path)["index"].tolist() == list(range(12))
+    assert check(path) == []
+    assert [p.name for p in tmp_path.iterdir()] == ["hops.h5"]
+    before = path.stat().st_mtime_ns
+    generate.fill(path, 4, CONFIGURATION, chunk=4, progress=False)
+    assert path.stat().st_mtime_ns == before  # with nothing to join, nothing is written
+    sizes: list[int] = []
+    monkeypatch.setattr(chunks, "simulate", lambda s, **k: sizes.append(len(s)) or _simulate(s, **k))
+    assert len(generate.generate(path, 20, CONFIGURATION, chunk=4, progress=False)) == 20
+    assert sizes == [4, 4]
 
 
 def test_two_writers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
