@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -62,6 +63,7 @@ def run_on_cluster(
     Each worker takes one chunk at a time, on one thread of its own. A killed worker's chunk goes to another one.
     """
     distributed = _distributed()
+    run = uuid4().hex  # a scheduler takes tasks of one key for one task, also those of two runs
     with _client(distributed, address, workers) as client:
         waiting = iter(tasks)
         crew = _Crew(client)
@@ -70,7 +72,8 @@ def run_on_cluster(
 
         def send() -> None:
             for task in islice(waiting, max(1, AHEAD * crew.size() - len(of))):
-                future = client.submit(work, task, threads=1, retries=retries, pure=False, key=f"hops-{task.first}-{task.last}")
+                key = f"hops-{task.first}-{task.last}-{run}"
+                future = client.submit(work, task, threads=1, retries=retries, pure=False, key=key)
                 of[future.key] = task
                 ready.add(future)
 

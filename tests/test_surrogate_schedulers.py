@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from surrogate import dataset, generate, schedule
-from surrogate.chunks import run_chunk
+from surrogate.chunks import Task, run_chunk
 from surrogate.dataset import Configuration
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import InvalidParameterError, SkippedChunksError
@@ -134,6 +134,22 @@ def test_workers_that_come_later_get_chunks_too(tmp_path: Path, monkeypatch: pyt
         generate.fill(path, HOPS, CONFIGURATION, chunk=CHUNK, scheduler=address, progress=False, work=Meeting.work)
     assert Meeting.complete.is_set()
     assert len(dataset.read(path)) == HOPS
+
+
+def test_two_runs_on_one_scheduler_get_chunks_of_their_own(cluster: Any) -> None:
+    def run(seed: int) -> Iterator[schedule.Outcome]:
+        tasks = [Task(Configuration(scene=CONFIGURATION.scene, seed=seed), first, first + 2) for first in range(0, 8, 2)]
+        return schedule.run_on_cluster(tasks, run_chunk, cluster.scheduler_address, None, 0, lambda hops: None)
+
+    first = run(2)
+    came = {2: [next(first)]}  # the first run's other chunks are on the cluster, or done, while the second works its own off
+    came |= {3: list(run(3))}
+    came[2] += list(first)
+    for seed, outcomes in came.items():
+        assert sorted(task.first for task, _ in outcomes) == [0, 2, 4, 6]
+        for _, data in outcomes:
+            assert isinstance(data, dataset.HopData)
+            assert data.configuration["seed"] == seed
 
 
 def test_scheduler_is_found_by_its_file(tmp_path: Path, cluster: Any, digest: str, monkeypatch: pytest.MonkeyPatch) -> None:
