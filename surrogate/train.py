@@ -81,7 +81,8 @@ def train(
     """Train on the usable hops of ``data``; returns the net with the least validation error and its card.
 
     With ``state``, a file that training saves itself in from time to time: found again with the same data and settings, it
-    is continued, and ends with the bits of a training that was never interrupted. It is removed at the end.
+    is continued, and ends with the bits of a training that was never interrupted. It stays there for the caller to remove when
+    the net is safely written: until then it is all that a failure to write leaves of the training.
     """
     started = time.perf_counter()
     split = data.split(config.validation, config.test)
@@ -115,8 +116,6 @@ def train(
             name: rmse(net, data.rows(kept)) for name, kept in data.split(config.validation, config.test).items() if len(kept)
         },
     }
-    if state is not None:
-        state.unlink(missing_ok=True)
     return net, card
 
 
@@ -211,5 +210,6 @@ def main(config: TrainCommand) -> None:
     state = config.out.with_suffix(".state.safetensors")
     net, card = train(dataset.read(config.data), config, state=state, log=config.log)
     model.save(net, config.out, card)
+    state.unlink(missing_ok=True)
     shown = ", ".join(f"{name} {value:.3g}" for name, value in card["rmse"].get("test", card["rmse"]["train"]).items())
     print(f"{config.out}: {card['epochs']} epochs in {card['seconds']:.1f} s; RMSE {shown}")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from surrogate import descent, evaluate, model
+from surrogate import dataset, descent, evaluate, model
 from surrogate.dataset import COLUMNS, Configuration, HopData, split_share
 from surrogate.descent import Descent
 from surrogate.generate import sample_stretches
@@ -18,9 +18,10 @@ from surrogate.kriging import fit_kriging
 from surrogate.model import OUTPUTS, HopNet, NetConfig
 from surrogate.outputs import LANDING
 from surrogate.scores import LEVELS, calibrate, coverage, of_data, rmse, spread
-from surrogate.train import TrainConfig, _start, train
+from surrogate.train import TrainCommand, TrainConfig, _start, train
+from surrogate.train import main as train_command
 from tensegrity_gym import Lattice, Scene, simulate
-from tensegrity_gym.errors import DataFileError, InvalidParameterError, InvalidStretchesError
+from tensegrity_gym.errors import DataFileError, InvalidParameterError, InvalidStretchesError, OutputFolderError
 
 LATTICE = Lattice()
 QUICK = TrainConfig(net=NetConfig(hidden=(32,), members=2), epochs=150)
@@ -271,10 +272,37 @@ def test_killed_training_goes_on_with_the_same_bits(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(Descent, "run_epoch", lambda self: ran.append(self.epoch) or run_epoch(self))
     resumed, card = train(data, config, progress=False, state=state)
     assert ran == list(range(17, 30))
-    assert not state.exists()
+    assert state.exists()  # for the caller to remove, when the net is written
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
     assert card["validation_error"] == whole_card["validation_error"]
+
+
+def test_a_net_that_cannot_be_written_is_trained_already_on_the_next_try(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = dataset.write(tmp_path / "hops.h5", closed_form_data(60))
+    out, state = tmp_path / "net.safetensors", tmp_path / "net.state.safetensors"
+    command = TrainCommand(**{**vars(QUICK), "epochs": 6, "data": data, "out": out})
+    whole, _ = train(dataset.read(data), command, progress=False)
+    monkeypatch.setattr(descent, "SAVE_SECONDS", 0.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(model, "save", full_disk)
+        with pytest.raises(OutputFolderError):
+            train_command(command)
+    assert state.exists()
+    with monkeypatch.context() as patch:
+        patch.setattr(Descent, "run_epoch", None)  # there is none left to run
+        train_command(command)
+    assert not state.exists()
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, model.load(out)[0].state_dict()[name]), name
+    ran, run_epoch = [], Descent.run_epoch
+    monkeypatch.setattr(Descent, "run_epoch", lambda self: ran.append(self.epoch) or run_epoch(self))
+    train_command(command)
+    assert ran == list(range(6))  # one that was finished trains anew
+
+
+def full_disk(*_: object) -> None:
+    raise OutputFolderError("no room")
 
 
 def test_saved_training_of_other_settings_is_not_continued_and_a_damaged_one_is_refused(tmp_path: Path) -> None:

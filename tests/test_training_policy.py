@@ -16,11 +16,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from surrogate.storage import read_sealed, write_sealed
 from tensegrity_gym import Scene
-from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.errors import DataFileError, InvalidParameterError, OutputFolderError
 from tensegrity_gym.scene_ranges import scene_ranges
 from tensegrity_gym.task import reach
+from training import checkpoint
 from training import train_policy as module
 from training.algorithms import hyperparameters
+from training.compare.config import CompareConfig
+from training.compare.run import Comparison
 from training.inverse import InverseConfig, InversePlanner
 from training.planner import NearestHopPlanner, Planner
 from training.policies import ActorPolicy, _mlp
@@ -28,7 +31,7 @@ from training.refine import RefiningPlanner
 from training.sb3_vec_env import BatchedHopVecEnv, make_env
 from training.similarity import Scaling
 from training.tandem import TandemConfig, TandemPlanner
-from training.train_policy import PolicyConfig, train_policy
+from training.train_policy import PolicyCommand, PolicyConfig, train_policy
 
 QUICK = Scene(duration=0.05)
 VARIED = scene_ranges({"gravity": (1.6, 9.81), "friction": (0.3, 0.8), "duration": 0.05})
@@ -85,6 +88,52 @@ def test_killed_training_goes_on_with_the_same_bits(
     assert 500 < card["simulating_seconds"] < 600
     for name, values in whole[config.calls].layers.state_dict().items():
         assert torch.equal(values, resumed[config.calls].layers.state_dict()[name])
+    assert state.exists()  # for the caller to remove, when the actors are written
+
+
+def test_a_policy_that_cannot_be_written_goes_on_from_its_last_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Scene, "preset", lambda *_, **__: QUICK)
+    out, state = tmp_path / "policy.safetensors", tmp_path / "policy.training"
+    command = PolicyCommand(**{**vars(SMALL), "out": out})
+    whole, _ = train_policy(QUICK, SMALL, progress=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(ActorPolicy, "save", full_disk)
+        with pytest.raises(OutputFolderError):
+            module.main(command)
+    assert state.exists()
+    taken, restore = [], checkpoint.restore
+    monkeypatch.setattr(checkpoint, "restore", lambda path, model, *a: (restore(path, model, *a), taken.append(model))[0])
+    module.main(command)
+    assert len(taken) == 1
+    assert not state.exists()
+    for name, values in whole[SMALL.calls].layers.state_dict().items():
+        assert torch.equal(values, ActorPolicy.load(out).layers.state_dict()[name])
+
+
+def full_disk(*_: object) -> None:
+    raise OutputFolderError("no room")
+
+
+def test_a_comparison_keeps_a_training_until_its_policy_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    actor = ActorPolicy(_mlp([2, 8, 4]), Scaling((0.155,)))
+    card = {"seconds": 1.0, "simulating_seconds": 0.5, "train": {"hyperparameters": {}}}
+
+    def trained(*_: object, state: Path, **__: object) -> Any:
+        state.write_bytes(b"state")
+        return {16: actor}, card
+
+    monkeypatch.setattr(module, "train_policy", trained)
+    comparison = Comparison(CompareConfig(out=tmp_path, quick=True, progress=False))
+    monkeypatch.setattr(comparison, "_score", lambda *_: None)
+    state = tmp_path / "policy_sac_0_16.training"
+    with monkeypatch.context() as patch:
+        patch.setattr(ActorPolicy, "save", full_disk)
+        with pytest.raises(OutputFolderError):
+            comparison._policy("sac", 0, 16)
+    assert state.exists()
+    comparison._policy("sac", 0, 16)
     assert not state.exists()
 
 

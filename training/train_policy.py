@@ -162,7 +162,7 @@ def train_policy(
     """Train for ``config.calls`` hops; returns actors as they were after each of ``budgets`` hops, and a card.
 
     The last actor, after all the hops, is always among them. ``state`` is a file from which a killed training goes on,
-    with the same bits; it is removed at the end.
+    with the same bits; it stays there for the caller to remove when the actors are safely written.
     """
     if config.calls < 1 or any(not 0 < b <= config.calls for b in budgets):
         raise InvalidParameterError(
@@ -196,8 +196,6 @@ def train_policy(
         model.learn(config.calls - before, callback=CallbackList(callbacks), reset_num_timesteps=before == 0)
         watch.keep()
         calls = before + hops.simulator_calls
-    if state is not None:
-        state.unlink(missing_ok=True)
     card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": told, "simulator_calls": calls}
     card |= {"evaluations": watch.evaluations} if config.evaluate_every else {}
     seconds, simulating = watch.seconds()
@@ -222,6 +220,7 @@ def main(config: PolicyCommand) -> None:
     state = config.out.with_suffix(".training")
     actors, card = train_policy(scene, plain, state=state, tensorboard=config.tensorboard)
     actors[config.calls].save(config.out, card)
+    state.unlink(missing_ok=True)
     print(f"{config.out}: {card['algorithm']}, {card['simulator_calls']} simulator calls in {card['seconds']:.1f} s")
     for found in card.get("evaluations", []):
         print(f"  after {found['calls']} hops: mean reward {found['reward']:.3f} on 32 episodes")

@@ -281,6 +281,7 @@ class Comparison:
             state = path.with_suffix(".training")
             actors, card = train_policy(self.scenes, settings, progress=self.config.progress, state=state)
             actors[budget].save(path, card)
+            state.unlink(missing_ok=True)
             return {
                 "seconds": card["seconds"],
                 "simulating": card["simulating_seconds"],
