@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from surrogate.hops import PHYSICS, check_parts
 from surrogate.outputs import LANDING, OUTPUTS, Output, scene_columns, target_columns
 from surrogate.schema import SCENE_VALUES
-from surrogate.storage import atomic_path, ensure_folder, read_json, write_json
+from surrogate.storage import CARD, atomic_path, beside, ensure_folder, read_json, write_json
 from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE, Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, InvalidStretchesError
 
@@ -312,6 +312,7 @@ def _products(permutations: np.ndarray, signs: np.ndarray) -> np.ndarray:
 def save(net: HopNet, path: Path | str, card: dict[str, Any]) -> Path:
     """Write weights and normalisers to ``path`` (safetensors) and the card, with their checksum, to ``path`` .json."""
     path = Path(path)
+    kept = beside(path, CARD)
     ensure_folder(path.parent)
     content = save_tensors({name: value.cpu().contiguous() for name, value in net.state_dict().items()})
     with atomic_path(path) as temporary:
@@ -325,17 +326,18 @@ def save(net: HopNet, path: Path | str, card: dict[str, Any]) -> Path:
         "outputs": [o.name for o in OUTPUTS],
         "sha256": hashlib.sha256(content).hexdigest(),
     }
-    write_json(path.with_suffix(".json"), card | fixed)
+    write_json(kept, card | fixed)
     return path
 
 
 def load(path: Path | str) -> tuple[HopNet, dict[str, Any]]:
     """Read a checkpoint and its card; nothing is unpickled.
 
-    Raises DataFileError for a missing, damaged or foreign one (another format, or another version of the physics).
+    Raises DataFileError for a missing, damaged or foreign one (another format, or another version of the physics), and
+    InvalidParameterError for the name of a file that lies beside one.
     """
     path = Path(path)
-    card = read_json(path.with_suffix(".json"))
+    card = read_json(beside(path, CARD))
     expected = {"format": FORMAT, "model_version": MODEL_VERSION, "outputs": [o.name for o in OUTPUTS]}
     for name, value in expected.items():
         came = card.get(name) if isinstance(card, dict) else None

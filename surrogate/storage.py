@@ -14,12 +14,21 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from tensegrity_gym.errors import DataFileError, FileInUseError, OutputFolderError
+from tensegrity_gym.errors import DataFileError, FileInUseError, InvalidParameterError, OutputFolderError
 
 #: Reasons for which the system refuses to write: no space, no quota, file too large, read-only.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 #: How a sealed file begins; then come the SHA-256 of its content in hex, a line feed and the content.
 SEAL = b"tensegrity_gym sealed/1 sha256 "
+#: How checkpoints end.
+CHECKPOINT = ".safetensors"
+#: How the files beside a checkpoint end, and what they are.
+CARD, NET_STATE, POLICY_STATE = ".json", ".state.safetensors", ".training"
+BESIDE = {
+    CARD: "a checkpoint's card",
+    NET_STATE: "the state of a surrogate's unfinished training",
+    POLICY_STATE: "the state of a policy's unfinished training",
+}
 PACKAGES = ("numpy", "numba", "scipy", "h5py", "gymnasium", "torch", "stable-baselines3")
 
 
@@ -134,6 +143,23 @@ def write_sealed(path: Path | str, content: bytes) -> None:
     """Write ``content`` atomically, behind its SHA-256."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+
+
+def beside(path: Path | str, ending: str) -> Path:
+    """The file that lies beside checkpoint ``path``: its name, without the .safetensors if it has one, and ``ending``.
+
+    Only that suffix is taken off: net_lr0.001 and net_lr0.003 are two names, each with files of its own. Names that are those
+    of files beside a checkpoint are refused.
+    """
+    path = Path(path)
+    taken = next((e for e in BESIDE if path.name.endswith(e)), None)
+    if taken is not None:
+        better = path.with_name((path.name.removesuffix(taken) or "net") + CHECKPOINT)
+        raise InvalidParameterError(
+            f"expected the name of a checkpoint, such as {better}, got {path}: what ends in {taken} is {BESIDE[taken]}; "
+            "choose another name"
+        )
+    return path.with_name(path.name.removesuffix(CHECKPOINT) + ending)
 
 
 def read_sealed(path: Path | str) -> bytes:

@@ -19,7 +19,7 @@ from surrogate.descent import Descent, Rows
 from surrogate.model import HopNet, NetConfig, one_thread
 from surrogate.outputs import OUTPUTS, scene_columns, target_columns
 from surrogate.scores import calibrate, rmse
-from surrogate.storage import hash_of
+from surrogate.storage import NET_STATE, beside, hash_of
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
 
@@ -207,7 +207,7 @@ def _logger(folder: Path | None, done: int) -> Callable[[int, dict[str, float]],
 
 def main(config: TrainCommand) -> None:
     """Entry of ``python -m surrogate train``."""
-    state = config.out.with_suffix(".state.safetensors")
+    state = beside(config.out, NET_STATE)
     net, card = train(dataset.read(config.data), config, state=state, log=config.log)
     model.save(net, config.out, card)
     state.unlink(missing_ok=True)

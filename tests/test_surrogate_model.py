@@ -18,6 +18,7 @@ from surrogate.kriging import fit_kriging
 from surrogate.model import OUTPUTS, HopNet, NetConfig
 from surrogate.outputs import LANDING
 from surrogate.scores import LEVELS, calibrate, coverage, of_data, rmse, spread
+from surrogate.storage import beside
 from surrogate.train import TrainCommand, TrainConfig, _start, train
 from surrogate.train import main as train_command
 from tensegrity_gym import Lattice, Scene, simulate
@@ -161,6 +162,33 @@ def test_checkpoint_round_trip_and_refusals(tmp_path: Path) -> None:
             model.load(path)
     with pytest.raises(DataFileError, match="readable JSON"):
         model.load(tmp_path / "absent.safetensors")
+
+
+def test_names_with_dots_are_names_of_their_own(tmp_path: Path) -> None:
+    assert beside("runs/net.safetensors", ".json") == Path("runs/net.json")
+    assert beside(Path("runs/net"), ".json") == Path("runs/net.json")
+    assert beside("runs/net.v2.safetensors", ".training") == Path("runs/net.v2.training")
+    net, _ = train(closed_form_data(40), replace(QUICK, epochs=1), progress=False)
+    rates = (0.001, 0.003)
+    for rate in rates:
+        model.save(net, tmp_path / f"net_lr{rate}", {"rate": rate})
+    assert [model.load(tmp_path / f"net_lr{rate}")[1]["rate"] for rate in rates] == list(rates)
+
+
+@pytest.mark.parametrize("name", ["net.json", "net.training", "net.state.safetensors", ".json"])
+def test_names_of_files_beside_a_checkpoint_are_refused_before_anything_is_done(name: str, tmp_path: Path) -> None:
+    net = HopNet(QUICK.net, *model.scene_symmetries(LATTICE, Scene()))
+    tries = (
+        lambda: train_command(TrainCommand(data=tmp_path / "absent.h5", out=tmp_path / name)),
+        lambda: model.save(net, tmp_path / name, {}),
+        lambda: model.load(tmp_path / name),
+    )
+    for attempt in tries:
+        with pytest.raises(
+            InvalidParameterError, match=r"such as .*/net\.safetensors, got .*what ends in .* is .*; choose another"
+        ):
+            attempt()
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("config", [NetConfig(hidden=(32, 16)), NetConfig(hidden=(16, 16, 16))])

@@ -116,6 +116,17 @@ def full_disk(*_: object) -> None:
     raise OutputFolderError("no room")
 
 
+def test_policies_with_dots_in_their_names_have_cards_of_their_own(tmp_path: Path) -> None:
+    for reach_of in (0.1, 0.2):
+        ActorPolicy(_mlp([2, 8, 4]), Scaling((reach_of,))).save(tmp_path / f"policy{reach_of}", {})
+    assert [ActorPolicy.load(tmp_path / f"policy{r}").scaling.scale for r in (0.1, 0.2)] == [(0.1,), (0.2,)]
+    for name in ("policy.json", "policy.training"):
+        with pytest.raises(InvalidParameterError, match="choose another name"):
+            module.main(PolicyCommand(out=tmp_path / name))
+        with pytest.raises(InvalidParameterError, match="choose another name"):
+            PLANNERS["actor"]().save(tmp_path / name, {})  # type: ignore[attr-defined]
+
+
 def test_a_comparison_keeps_a_training_until_its_policy_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     actor = ActorPolicy(_mlp([2, 8, 4]), Scaling((0.155,)))
     card = {"seconds": 1.0, "simulating_seconds": 0.5, "train": {"hyperparameters": {}}}

@@ -14,7 +14,7 @@ from surrogate import dataset, model
 from surrogate.dataset import Configuration, HopData
 from surrogate.generate import generate
 from surrogate.kriging import fit_kriging
-from surrogate.storage import package_versions
+from surrogate.storage import CARD, beside, package_versions
 from surrogate.train import TrainConfig, train
 from tensegrity_gym import MODEL_VERSION, Scene, simulate
 from tensegrity_gym.errors import InvalidParameterError
@@ -146,7 +146,7 @@ def _surrogate(stages: Stages, config: DemoConfig, data: HopData, held_out: HopD
         return {k: card[k] for k in ("epochs", "hops", "stopped_on", "rmse", "predicted", "spread", "seconds")}
 
     settings = {"train": asdict(config.surrogate), "hops": budget}
-    stages.run(name, settings, work, needs=["data", "targets"], files=[path.name, path.with_suffix(".json").name])
+    stages.run(name, settings, work, needs=["data", "targets"], files=[path.name, beside(path, CARD).name])
 
 
 def _plans(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, held_out: HopData, budgets: list[int]) -> None:
@@ -204,7 +204,7 @@ def _policy(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData,
         return {"answers": answers, "simulator_calls": card["simulator_calls"], "seconds": card["seconds"]}
 
     config_of_stage = {"policy": asdict(settings), "scene": asdict(scene), "budgets": budgets}
-    stages.run("policy", config_of_stage, work, needs=["targets"], files=[path.name, path.with_suffix(".json").name])
+    stages.run("policy", config_of_stage, work, needs=["targets"], files=[path.name, beside(path, CARD).name])
     ActorPolicy.load(path)  # a damaged or foreign checkpoint is found now, by name
 
 

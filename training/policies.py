@@ -15,7 +15,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import nn
 
-from surrogate.storage import atomic_path, ensure_folder, read_json, write_json
+from surrogate.storage import CARD, atomic_path, beside, ensure_folder, read_json, write_json
 from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training.planner import Prediction
@@ -69,6 +69,7 @@ class ActorPolicy:
     def save(self, path: Path | str, card: dict[str, Any]) -> Path:
         """Write weights (safetensors) and, beside them, the card with their checksum (.json)."""
         path = Path(path)
+        kept = beside(path, CARD)
         ensure_folder(path.parent)
         content = save_tensors(self.layers.state_dict())
         with atomic_path(path) as temporary:
@@ -80,14 +81,14 @@ class ActorPolicy:
             "squash": self.squash,
             "sha256": hashlib.sha256(content).hexdigest(),
         }
-        write_json(path.with_suffix(".json"), card | fixed)
+        write_json(kept, card | fixed)
         return path
 
     @classmethod
     def load(cls, path: Path | str) -> ActorPolicy:
         """Read a saved actor; DataFileError for a missing, damaged or foreign one."""
         path = Path(path)
-        card = read_json(path.with_suffix(".json"))
+        card = read_json(beside(path, CARD))
         for name, value in {"format": FORMAT, "model_version": MODEL_VERSION}.items():
             came = card.get(name) if isinstance(card, dict) else None
             if came != value:

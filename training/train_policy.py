@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 import tensegrity_gym  # noqa: F401  registers the env
 from surrogate.model import one_thread
-from surrogate.storage import hash_of
+from surrogate.storage import POLICY_STATE, beside, hash_of
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.scene_ranges import SceneRanges
@@ -217,7 +217,7 @@ def main(config: PolicyCommand) -> None:
     """Entry of ``python -m training policy``."""
     plain = PolicyConfig(**{name: getattr(config, name) for name in PolicyConfig.__dataclass_fields__})
     scene = Scene.preset(config.scene, landing=config.landing)
-    state = config.out.with_suffix(".training")
+    state = beside(config.out, POLICY_STATE)
     actors, card = train_policy(scene, plain, state=state, tensorboard=config.tensorboard)
     actors[config.calls].save(config.out, card)
     state.unlink(missing_ok=True)
