@@ -158,9 +158,12 @@ def beta_nll(net: HopNet, rows: Rows, beta: float) -> Tensor:
 def validation_error(net: HopNet, rows: Rows) -> float:
     """Geometric mean over outputs of the ensemble's RMSE in units of their spread.
 
-    Each output counts alike, however little of it can be known; those that no hop has do not count.
+    Each output counts alike, however little of it can be known; those that no hop has do not count. Infinite where the net says
+    of a known target what is no finite number: such weights are never the best.
     """
-    error = (net(rows.stretches, rows.scene).mean(dim=0) - rows.targets) / net.output_scale
-    square = torch.nanmean(error**2, dim=0)
-    square = square[torch.isfinite(square)]
-    return float(torch.exp(0.5 * torch.log(square.clamp(min=1e-12)).mean())) if len(square) else 0.0
+    square = ((net(rows.stretches, rows.scene).mean(dim=0) - rows.targets) / net.output_scale) ** 2
+    known = torch.isfinite(rows.targets)
+    if not torch.isfinite(square[known]).all():
+        return float("inf")
+    mean = torch.nanmean(torch.where(known, square, torch.nan), dim=0)[known.any(dim=0)]
+    return float(torch.exp(0.5 * torch.log(mean.clamp(min=1e-12)).mean())) if len(mean) else 0.0

@@ -100,6 +100,11 @@ def train(
     descent = Descent(net, rows, split["train"], split[stop_on], config)
     before = descent.resume(state, fingerprint)
     _descend(descent, config, progress, desc, state, fingerprint, _logger(log, descent.epoch))
+    if not np.isfinite(descent.best):  # the best weights are those that it began with
+        raise InvalidParameterError(
+            f"lr: expected one small enough for a finite {stop_on} error, got {config.lr:g}, with which none of {descent.epoch} "
+            "epochs had one; choose a smaller one"
+        )
     held_back = data.rows(data.split(config.validation, config.test)[stop_on])
     calibrate(net, held_back)
     card = {

@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from surrogate import dataset, descent, evaluate, model
 from surrogate.dataset import COLUMNS, Configuration, HopData, split_share
-from surrogate.descent import Descent
+from surrogate.descent import Descent, Rows
 from surrogate.generate import sample_stretches
 from surrogate.kriging import fit_kriging
 from surrogate.model import OUTPUTS, HopNet, NetConfig
@@ -331,6 +331,48 @@ def test_a_net_that_cannot_be_written_is_trained_already_on_the_next_try(tmp_pat
 
 def full_disk(*_: object) -> None:
     raise OutputFolderError("no room")
+
+
+@pytest.mark.parametrize("good", [4, 0])
+def test_weights_that_are_no_numbers_are_never_the_best(good: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, config, losses = closed_form_data(40), replace(QUICK, epochs=8), iter(range(8))
+    beta_nll = descent.beta_nll
+    # one batch an epoch; no gradient of what is no number is one
+    monkeypatch.setattr(descent, "beta_nll", lambda *a: beta_nll(*a) * (1.0 if next(losses) < good else torch.nan))
+    if not good:
+        with pytest.raises(InvalidParameterError, match=r"lr: expected one small enough.*none of 8 epochs.*choose a smaller"):
+            train(data, config, progress=False)
+        return
+    net, card = train(data, config, progress=False)
+    assert card["epochs"] == 8
+    assert 0 < card["validation_error"] < 10
+    assert all(torch.isfinite(p).all() for p in net.parameters())
+
+
+def test_validation_error_looks_at_all_that_is_known_and_at_nothing_else() -> None:
+    torch.manual_seed(3)
+    targets = torch.randn(50, len(OUTPUTS))
+    targets[::3, 4], targets[:, 7] = torch.nan, torch.nan
+    rows = Rows(torch.zeros(50, 4), torch.zeros(50, 0), targets)
+
+    class Says(torch.nn.Module):
+        output_scale = torch.rand(len(OUTPUTS)) + 0.5
+        said = torch.randn(3, 50, len(OUTPUTS))
+
+        def forward(self, stretches: torch.Tensor, scene: torch.Tensor) -> torch.Tensor:
+            return self.said
+
+    net = Says()
+    square = torch.nanmean(((net.said.mean(dim=0) - targets) / net.output_scale) ** 2, dim=0)
+    square = square[torch.isfinite(square)]
+    assert len(square) == len(OUTPUTS) - 1
+    expected = float(torch.exp(0.5 * torch.log(square).mean()))
+    assert descent.validation_error(net, rows) == expected  # type: ignore[arg-type]
+    net.said[:, 0, 4], net.said[0, 1, 7] = torch.nan, torch.inf  # of targets that nobody knows
+    assert descent.validation_error(net, rows) == expected  # type: ignore[arg-type]
+    for wrong in (torch.nan, torch.inf, 1e30):  # the square of the last is no number of 32 bits
+        net.said[1, 1, 4] = wrong
+        assert descent.validation_error(net, rows) == np.inf  # type: ignore[arg-type]
 
 
 def test_saved_training_of_other_settings_is_not_continued_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
