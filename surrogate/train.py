@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -54,6 +55,26 @@ class TrainConfig:
     """Seed of weights and batches."""
     device: str = "auto"
     """Where to train: cpu, cuda, or auto (cuda where there is one)."""
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "steps", "patience", "batch"):
+            if getattr(self, name) < 1:
+                raise InvalidParameterError(
+                    f"{name}: expected an integer >= 1, got {getattr(self, name)}; with less nothing is learnt"
+                )
+        if not 0 < self.lr < math.inf:
+            raise InvalidParameterError(f"lr: expected a finite number > 0, got {self.lr:g}; {TrainConfig.lr:g} is usual")
+        if not 0 <= self.weight_decay < math.inf:
+            raise InvalidParameterError(f"weight_decay: expected a finite number >= 0, got {self.weight_decay:g}; 0 is none")
+        if not 0 <= self.beta <= 1:
+            raise InvalidParameterError(f"beta: expected a number from 0 to 1, got {self.beta:g}; {TrainConfig.beta:g} is usual")
+        if not (self.validation >= 0 and self.test >= 0 and self.validation + self.test < 1):
+            raise InvalidParameterError(
+                f"validation and test: expected shares >= 0 that leave some hops to train on, got {self.validation:g} and "
+                f"{self.test:g}; choose them so that their sum is below 1"
+            )
+        if not 0 <= self.seed < 2**64:
+            raise InvalidParameterError(f"seed: expected an integer from 0 to 2^64 - 1, got {self.seed}; choose another")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -331,6 +332,29 @@ def test_a_net_that_cannot_be_written_is_trained_already_on_the_next_try(tmp_pat
 
 def full_disk(*_: object) -> None:
     raise OutputFolderError("no room")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"batch": -1}, r"batch: expected an integer >= 1, got -1"),
+        ({"batch": 0}, r"batch: expected an integer >= 1, got 0"),
+        ({"patience": 0}, r"patience: expected an integer >= 1, got 0"),
+        ({"epochs": 0}, r"epochs: expected an integer >= 1, got 0"),
+        ({"steps": 0}, r"steps: expected an integer >= 1, got 0"),
+        ({"lr": 0.0}, r"lr: expected a finite number > 0, got 0; 0.003 is usual"),
+        ({"lr": float("nan")}, r"lr: expected a finite number > 0, got nan"),
+        ({"weight_decay": -1.0}, r"weight_decay: expected a finite number >= 0, got -1"),
+        ({"beta": 2.0}, r"beta: expected a number from 0 to 1, got 2"),
+        ({"validation": 0.8, "test": 0.5}, r"validation and test: expected shares .*, got 0.8 and 0.5; .* below 1"),
+        ({"validation": -0.1}, r"validation and test: expected shares >= 0"),
+        ({"test": float("nan")}, r"validation and test: expected shares >= 0"),
+        ({"seed": -1}, r"seed: expected an integer from 0"),
+    ],
+)
+def test_settings_that_teach_nothing_are_named(wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(InvalidParameterError, match=said):
+        replace(QUICK, **wrong)
 
 
 @pytest.mark.parametrize("good", [4, 0])
