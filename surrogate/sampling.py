@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -66,15 +67,21 @@ def read_stretches(path: Path | str, n_actuators: int = 4) -> Floats:
     """Stretches from a .npy file or a text file of numbers, one hop a line, shape (n, n_actuators)."""
     path = Path(path)
     try:
-        values = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter="," if path.suffix == ".csv" else None)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # which is said below, by name
+            values = (
+                np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter="," if path.suffix == ".csv" else None)
+            )
         values = np.atleast_2d(np.asarray(values, dtype=np.float64))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError) as error:
         raise DataFileError(f"{path}: expected stretches as .npy, .csv or plain text, one hop a line ({error})") from error
     low, high = STRETCH_RANGE
-    if values.shape[1] != n_actuators or not np.all((values >= low) & (values <= high)):
+    if not values.size:
+        raise DataFileError(f"{path}: expected stretches of one hop at least, got none; write {n_actuators} numbers a line")
+    if values.ndim != 2 or values.shape[1] != n_actuators or not np.all((values >= low) & (values <= high)):
         raise DataFileError(
             f"{path}: expected (n, {n_actuators}) stretches in [{low:g}, {high:g}], got shape {values.shape} "
-            f"in [{values.min():g}, {values.max():g}]; clip or rescale them"
+            f"in [{values.min():g}, {values.max():g}]; reshape, clip or rescale them"
         )
     return values
 

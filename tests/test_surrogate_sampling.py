@@ -67,6 +67,24 @@ def test_stretches_from_a_file(tmp_path: Path) -> None:
         read_stretches(tmp_path / "bad.csv")
 
 
+def test_files_without_stretches_or_of_another_shape_are_named(tmp_path: Path) -> None:
+    for name in ("none.csv", "none.txt"):
+        (tmp_path / name).write_text("# a heading alone\n")
+        with pytest.raises(DataFileError, match=rf"{name}: expected stretches of one hop at least, got none"):
+            read_stretches(tmp_path / name)
+    (tmp_path / "cut.npy").write_bytes(b"")
+    np.save(tmp_path / "none.npy", np.zeros((0, 4)))
+    for name, said in (("cut.npy", "one hop a line"), ("none.npy", "got none")):
+        with pytest.raises(DataFileError, match=f"{name}.*{said}"):
+            read_stretches(tmp_path / name)
+    for shape in ((2, 4, 3), (2, 3), (1, 4, 1, 1), ()):
+        np.save(tmp_path / "bad.npy", np.full(shape, 0.5))
+        with pytest.raises(DataFileError, match=r"expected \(n, 4\) stretches.*got shape .*; reshape"):
+            read_stretches(tmp_path / "bad.npy")
+    np.save(tmp_path / "one.npy", np.full(4, 0.5))
+    assert read_stretches(tmp_path / "one.npy").shape == (1, 4)
+
+
 def test_scenes_vary_in_groups_and_hop_in_their_own(tmp_path: Path) -> None:
     ranges = {"gravity": (1.6, 9.8), "friction": (0.3, 0.8)}
     configuration = Configuration(scene=SHORT, scene_ranges=ranges, hops_per_scene=3)
