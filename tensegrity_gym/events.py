@@ -51,6 +51,7 @@ def measure(records: rec.HopRecords, problem: Problem, lattice: Lattice) -> dict
         "impacts": records.impacts,
         "impact_count": records.impact_count,
         "end_time": records.time[:, end],
+        "end_nodes": records.state[:, end, 0, : lattice.n_nodes],
         "status": records.status,
         "failed_mass": records.failed_mass,
         "failed_member": records.failed_member,

@@ -61,6 +61,7 @@ class HopResult:
     energies: Floats  #: at release, take-off, touchdown, end [J], columns ENERGY_NAMES, shape (n, 4, 7)
     stored_energy: Floats  #: elastic energy at release, in the locked lattice [J], shape (n,)
     start_positions: Floats = field(repr=False)  #: [m], shape (n, n_masses, 3)
+    end_nodes: Floats = field(repr=False)  #: where the nodes are at the end, no answer in a failed hop [m], shape (n, n_nodes, 3)
     equilibria: Equilibria  #: what the hops started from; None for drops
     structure: Structure = field(repr=False)  #: the lattice as it was simulated
     fidelity: Fidelity  #: how it was simulated and why so; ``str`` of it is one line

@@ -26,8 +26,6 @@ from tensegrity_gym.viewer import RENDER_FPS, RENDER_MODES, Viewer, check_render
 
 #: Hops are followed for this many times the scene's duration, so that nearly all come to rest.
 PATIENCE = 2.0
-#: Rate of the frames from which the final posture is read, where nothing is rendered [1/s].
-POSTURE_RATE = 10.0
 #: Half a turn about the diagonal x = y: maps the lattice onto itself, upside down.
 FLIP = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
@@ -161,17 +159,15 @@ class TensegrityTravelEnv(gym.Env[np.ndarray, np.ndarray]):
         start, before = (float(self.position[0]), float(self.position[1]), self.heading), self._distance()
         downhill = _wrapped(self.scene.slope_direction - self.heading)
         scene = replace(self.scene, slope_direction=downhill, duration=PATIENCE * self.scene.duration)
-        rate = self._viewer.rate or POSTURE_RATE
-        hop = simulate(stretches, scene=scene, lattice=self.lattice, trajectory_rate=rate, **self.levers)
+        hop = simulate(stretches, scene=scene, lattice=self.lattice, trajectory_rate=self._viewer.rate, **self.levers)
         self.simulator_calls += 1
         self._hops += 1
         failed = bool(task.failed(hop.status)[0])
         pose = Pose(0.0, False, 0.0)
         landing: Floats = np.zeros(2)
-        assert hop.trajectory is not None  # it was asked for
         if not failed:
             landing = turned(hop.rest[0], self.heading)
-            pose = read_pose(hop.trajectory.positions[0, int(hop.trajectory.frames[0]) - 1], self.lattice)
+            pose = read_pose(hop.end_nodes[0], self.lattice)  # not a frame: those depend on what is rendered
             self.position = self.position + landing
             self.heading = _wrapped(self.heading + pose.heading)
             self._viewer.hop(hop, 0, start)

@@ -316,6 +316,13 @@ def test_landing_is_read_where_the_scene_says(landing: str) -> None:
     assert np.linalg.norm(r.rest - r.touchdown) > 1e-4
 
 
+def test_the_nodes_at_the_end_are_those_that_displacements_are_read_from() -> None:
+    result = hops()
+    assert result.end_nodes.shape == (len(STRETCHES), LATTICE.n_nodes, 3)
+    moved = (result.end_nodes - result.start_positions[:, : LATTICE.n_nodes]).mean(axis=1)
+    np.testing.assert_allclose(moved[:, :2], result.rest_nodes, atol=1e-12)
+
+
 def test_frames_come_at_the_asked_rate_and_time() -> None:
     r = hops()
     for hop in range(len(STRETCHES)):

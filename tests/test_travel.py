@@ -68,11 +68,10 @@ def test_hops_are_chained_where_and_how_the_last_one_came_to_rest() -> None:
     for k in range(2):
         # to the last bit the angle that the env takes: tumbling hops multiply a difference by more than 1e10
         there = replace(scene, slope_direction=travel._wrapped(0.4 - heading), duration=PATIENCE * 1.2)
-        hop = simulate(UNEVEN.astype(float), scene=there, trajectory_rate=10.0)
-        assert hop.trajectory is not None
+        hop = simulate(UNEVEN.astype(float), scene=there)
         before = np.linalg.norm(info["goal"] - position)
         position = position + turned(hop.rest[0], heading)
-        pose = read_pose(hop.trajectory.positions[0, int(hop.trajectory.frames[0]) - 1], LATTICE)
+        pose = read_pose(hop.end_nodes[0], LATTICE)
         heading = travel._wrapped(heading + pose.heading)
         observation, reward, terminated, truncated, info = env.step(UNEVEN)
         np.testing.assert_allclose(info["position"], position, atol=1e-9)
@@ -116,6 +115,18 @@ def test_seeds_fix_goals_and_hops_exactly() -> None:
     assert not np.array_equal(runs[0][0], runs[0][2])
 
 
+@pytest.mark.parametrize("duration", [0.15, 0.01])  # the second: too short for a frame at any rate
+def test_rendering_changes_nothing_that_is_observed(duration: float) -> None:
+    """The heading is the one where the hop ended, as the position is; no frame is as late as that, and frames follow the mode."""
+    seen = []
+    for mode in (None, "rgb_array", "rgb_array_list"):
+        env = TensegrityTravelEnv(scene=Scene(duration=duration), render_mode=mode)
+        env.reset(seed=4)
+        observation, reward, *_, info = env.step(UNEVEN)
+        seen.append((*observation, reward, info["heading"], info["tilt"], info["upside_down"]))
+    assert seen[0] == seen[1] == seen[2]
+
+
 def test_an_episode_ends_on_arrival_or_after_the_last_hop() -> None:
     env = TensegrityTravelEnv(scene=SHORT, max_hops=2)
     env.reset(options={"goal": (0.05, 0.0)})
@@ -155,7 +166,7 @@ def test_every_option_does_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_failed_hop_gets_the_worst_reward_and_ends_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = simulate(UNEVEN.astype(float), scene=SHORT, trajectory_rate=10.0)
+    real = simulate(UNEVEN.astype(float), scene=SHORT)
     broken = replace(real, status=np.array([int(HopStatus.UNSTABLE)]), rest=np.full((1, 2), np.nan))
     monkeypatch.setattr(travel, "simulate", lambda *_, **__: broken)
     env = TensegrityTravelEnv(scene=SHORT)
