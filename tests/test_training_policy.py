@@ -11,7 +11,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from surrogate.storage import read_sealed, write_sealed
@@ -303,6 +305,50 @@ def test_batched_envs_give_what_the_registered_env_gives_one_after_the_other() -
         for one, other in zip(theirs, ours, strict=True):
             assert np.array_equal(one, other)
     assert batched.simulator_calls == 6
+
+
+class Doubled(FlattenExtractor):
+    """Observations that are changed on their way into the layers."""
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return 2 * super().forward(observations)
+
+
+#: Always copied: stable-baselines3 writes into the mapping it is given.
+RELU = {"net_arch": [8, 8], "activation_fn": torch.nn.ReLU}
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "said"),
+    [
+        (PPO, {"policy_kwargs": {"net_arch": [8]}}, r"ReLU alone, got \['Tanh'\]"),  # its default
+        (SAC, {"policy_kwargs": RELU | {"activation_fn": torch.nn.ELU}}, r"ReLU alone, got \['ELU'\]"),
+        (TD3, {"policy_kwargs": RELU | {"activation_fn": torch.nn.Tanh}}, r"ReLU alone, got \['Tanh'\]"),
+        (SAC, {"policy_kwargs": {**RELU}, "use_sde": True}, "use_sde=False, got use_sde=True"),
+        (PPO, {"policy_kwargs": {**RELU}, "use_sde": True}, "use_sde=False, got use_sde=True"),
+        (SAC, {"policy_kwargs": RELU | {"features_extractor_class": Doubled}}, "got a Doubled"),
+        (PPO, {"policy_kwargs": RELU | {"features_extractor_class": Doubled}}, "got a Doubled"),
+    ],
+)
+def test_models_that_are_another_function_than_the_copy_are_refused(model: Any, options: dict[str, Any], said: str) -> None:
+    options = {"n_steps": 8, "batch_size": 8, **options} if model is PPO else options
+    with pytest.raises(InvalidParameterError, match=said):
+        ActorPolicy.from_model(model("MlpPolicy", make_env(QUICK, 0.5), device="cpu", **options), Scaling((0.5,)))
+
+
+def test_only_models_that_rescale_their_actions_themselves_may_ask_for_stretches() -> None:
+    raw = gym.make("TensegrityHop-v0", scene=QUICK)
+    with pytest.raises(InvalidParameterError, match=r"each in \(-1.0, 1.0\), got 4 outputs for Box\(0.2, 0.8"):
+        ActorPolicy.from_model(
+            PPO("MlpPolicy", raw, n_steps=8, batch_size=8, policy_kwargs={**RELU}, device="cpu"), Scaling((1.0,))
+        )
+    model = SAC("MlpPolicy", raw, policy_kwargs={**RELU}, device="cpu")
+    targets = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
+    copied = ActorPolicy.from_model(model, Scaling((1.0,))).predict(targets)[0]
+    np.testing.assert_allclose(copied, model.predict(targets, deterministic=True)[0], atol=1e-6)
+    model.action_space = gym.spaces.Box(0.2, 0.8, (3,))
+    with pytest.raises(InvalidParameterError, match="got 4 outputs"):
+        ActorPolicy.from_model(model, Scaling((1.0,)))
 
 
 def test_budgets_beyond_the_calls_are_refused() -> None:

@@ -37,14 +37,21 @@ class ActorPolicy:
 
     @classmethod
     def from_model(cls, model: Any, scaling: Scaling) -> ActorPolicy:
-        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on observations of that ``scaling``."""
+        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on observations of that ``scaling``.
+
+        Raises InvalidParameterError for a model whose actor is another function.
+        """
         policy = model.policy
+        if getattr(model, "use_sde", False):  # its actors end in other layers
+            raise InvalidParameterError("model: expected one with use_sde=False, got use_sde=True; train it without")
         if hasattr(policy, "mlp_extractor"):  # PPO's mean action is cut off, not squashed
             modules, squash = [*policy.mlp_extractor.policy_net, policy.action_net], "clip"
         elif hasattr(policy.actor, "latent_pi"):  # SAC
             modules, squash = [*policy.actor.latent_pi, policy.actor.mu], "tanh"
         else:  # TD3
-            modules, squash = list(policy.actor.mu), "tanh"
+            *modules, last = policy.actor.mu
+            modules, squash = modules if isinstance(last, nn.Tanh) else [*modules, last], "tanh"
+        _check_actor(model, modules, squash)
         found = [layer for layer in modules if isinstance(layer, nn.Linear)]
         copy = _mlp([found[0].in_features, *(layer.out_features for layer in found)])
         for mine, theirs in zip(list(copy)[::2], found, strict=True):
@@ -107,6 +114,30 @@ class ActorPolicy:
             return cls(layers, Scaling(tuple(kept["scale"]), tuple(kept["offset"]), kept["gravity"]), card["squash"])
         except (OSError, ValueError, KeyError, IndexError, TypeError, RuntimeError, SafetensorError) as error:
             raise DataFileError(f"{path}: expected a whole actor checkpoint ({error}); train it again") from error
+
+
+def _check_actor(model: Any, modules: list[nn.Module], squash: str) -> None:
+    """InvalidParameterError unless the observation, layers with ReLU and the squashed stretches are all there is."""
+    from stable_baselines3.common.torch_layers import FlattenExtractor  # whoever has such a model has loaded it already
+
+    hidden = {type(layer).__name__ for layer in modules if not isinstance(layer, nn.Linear)}
+    if not hidden <= {"ReLU"}:  # PPO's default is Tanh
+        raise InvalidParameterError(
+            f"model: expected hidden layers with ReLU alone, got {sorted(hidden)}; train it with "
+            "policy_kwargs={'activation_fn': torch.nn.ReLU}"
+        )
+    extractor = model.policy.pi_features_extractor if squash == "clip" else model.policy.actor.features_extractor
+    if type(extractor) is not FlattenExtractor:
+        raise InvalidParameterError(
+            f"model: expected observations that go straight into the layers, got a {type(extractor).__name__}; train it without"
+        )
+    space, width = model.action_space, getattr(modules[-1], "out_features", None)
+    ranges = [(-1.0, 1.0)] if squash == "clip" else [(-1.0, 1.0), STRETCH_RANGE]  # SAC and TD3 rescale their actions themselves
+    if space.shape != (width,) or not any(np.allclose(space.low, low) and np.allclose(space.high, high) for low, high in ranges):
+        raise InvalidParameterError(
+            f"model: expected as many outputs as actions, each in {' or '.join(map(str, ranges))}, got {width} outputs for "
+            f"{space}; train it on training.sb3_vec_env.make_env, which rescales them"
+        )
 
 
 def _mlp(widths: list[int]) -> nn.Sequential:
