@@ -23,7 +23,7 @@ from tensegrity_gym.scene_ranges import scene_ranges
 from tensegrity_gym.task import reach
 from training import checkpoint
 from training import train_policy as module
-from training.algorithms import hyperparameters
+from training.algorithms import check_rollout, hyperparameters, rollout_of
 from training.compare.config import CompareConfig
 from training.compare.run import Comparison
 from training.inverse import InverseConfig, InversePlanner
@@ -349,6 +349,26 @@ def test_only_models_that_rescale_their_actions_themselves_may_ask_for_stretches
     model.action_space = gym.spaces.Box(0.2, 0.8, (3,))
     with pytest.raises(InvalidParameterError, match="got 4 outputs"):
         ActorPolicy.from_model(model, Scaling((1.0,)))
+
+
+@pytest.mark.parametrize(
+    ("calls", "rollout", "near"), [(1, 1, 2), (101, 1, 100), (254, 2, 253), (1004, 4, 1003), (1006, 2, 1005), (10006, 2, 10005)]
+)
+def test_calls_that_no_long_rollout_divides_are_refused_for_ppo(calls: int, rollout: int, near: int) -> None:
+    said = f"got {calls}, which only those of {rollout} do; the nearest that is fine is {near}$"
+    with pytest.raises(InvalidParameterError, match=said):
+        train_policy(QUICK, PolicyConfig("ppo", calls=calls), progress=False)
+
+
+def test_ppo_takes_calls_that_a_rollout_divides_and_few_calls_whole() -> None:
+    asked = hyperparameters("ppo")["rollout"]
+    rollouts = {8: 8, 24: 24, 32: 32, 96: 48, 100: 20, 128: 64, 256: 64, 1000: 40, 10_000: 80, 100_000: 80}
+    for calls, rollout in rollouts.items():
+        config = PolicyConfig("ppo", calls=calls)
+        check_rollout(calls, asked, lambda number: PolicyConfig("ppo", calls=number).together)
+        assert rollout_of(calls, config.together, asked) == rollout
+    with pytest.raises(InvalidParameterError, match="raise rollout"):
+        check_rollout(8, 1, lambda _: 1)
 
 
 def test_budgets_beyond_the_calls_are_refused() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"sac": SAC, "td3": TD3, "ppo": PPO}
+#: Hops of a rollout that stable-baselines3's PPO takes, at least: it normalises advantages.
+LEAST_ROLLOUT = 2
 FOLDER = Path(__file__).parent / "hyperparameters"
 
 
@@ -48,10 +50,9 @@ def build(algorithm: str, values: Mapping[str, Any], venv: VecEnv, calls: int, s
     options = dict(values["model"]) | {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard and str(tensorboard)}
     policy = {"net_arch": list(values["hidden"]), "activation_fn": torch.nn.ReLU}
     if algorithm == "ppo":
-        steps = _divisor(calls // envs, max(1, values["rollout"] // envs))
-        rollout, parts = steps * envs, values["minibatches"]
+        rollout, parts = rollout_of(calls, envs, values["rollout"]), values["minibatches"]
         policy["log_std_init"] = values["log_std_init"]
-        options |= {"n_steps": steps, "batch_size": max(2, rollout // parts if rollout % parts == 0 else rollout)}
+        options |= {"n_steps": rollout // envs, "batch_size": max(2, rollout // parts if rollout % parts == 0 else rollout)}
     else:
         per_hop = min(values["updates"], values["max_updates"] / calls)
         options |= {
@@ -63,6 +64,33 @@ def build(algorithm: str, values: Mapping[str, Any], venv: VecEnv, calls: int, s
         size = venv.action_space.shape or ()
         options["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, values["action_noise"]))
     return ALGORITHMS[algorithm]("MlpPolicy", venv, policy_kwargs=policy, **options)
+
+
+def rollout_of(calls: int, envs: int, asked: int) -> int:
+    """Hops of PPO's rollouts: whole steps of all envs, at most ``asked`` hops where a step has no more, that divide ``calls``."""
+    return envs * _divisor(calls // envs, max(1, asked // envs))
+
+
+def check_rollout(calls: int, asked: int, envs_for: Callable[[int], int]) -> None:
+    """InvalidParameterError where rollouts of ``calls`` hops would be far shorter than ``asked``: PPO would learn from noise.
+
+    ``envs_for``: how many envs any number of calls gets.
+    """
+
+    def found(number: int) -> int:
+        return rollout_of(number, envs_for(number), asked)
+
+    def fine(number: int) -> bool:
+        return found(number) >= max(LEAST_ROLLOUT, min(asked, number) / 8)
+
+    if fine(calls):
+        return
+    others = (number for away in range(1, calls + 2) for number in (calls - away, calls + away) if number > 0)
+    near = next((number for number in others if fine(number)), None)
+    raise InvalidParameterError(
+        f"calls: expected a number that rollouts of about {asked} hops divide, got {calls}, which only those of {found(calls)} "
+        f"do; {'raise rollout in the hyper-parameters' if near is None else f'the nearest that is fine is {near}'}"
+    )
 
 
 def _divisor(number: int, most: int) -> int:

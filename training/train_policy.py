@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.task import check_fidelity
 from training import checkpoint
-from training.algorithms import build, env_count, hyperparameters
+from training.algorithms import build, check_rollout, env_count, hyperparameters
 from training.policies import ActorPolicy
 from training.sb3_vec_env import BatchedHopVecEnv
 from training.similarity import Scaling
@@ -172,6 +172,8 @@ def train_policy(
     scenes = scene if isinstance(scene, SceneRanges) else SceneRanges(scene)
     scaling, envs = Scaling.of(scenes), config.together
     values = hyperparameters(config.algorithm, config.hyperparameters)
+    if config.algorithm == "ppo":
+        check_rollout(config.calls, values["rollout"], lambda calls: replace(config, calls=calls).together)
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
     plain, told = asdict(config) | {"hyperparameters": values}, asdict(scenes if scenes.ranges else scenes.base)
