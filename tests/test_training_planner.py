@@ -194,6 +194,36 @@ def test_evolution_recovers_inverses_and_counts_its_calls(reach) -> None:
     assert stretches.max() <= 0.8
 
 
+def test_evolution_leaves_numpys_random_numbers_alone() -> None:
+    """cma seeds and draws from NumPy's global generator; that is the user's, also while hops are simulated."""
+    pytest.importorskip("cma")
+    stretches, targets = sample_stretches(20, 0), np.zeros((2, 2))
+    noise: list[float] = []
+
+    def land(asked: np.ndarray) -> np.ndarray:
+        noise.append(np.random.rand())  # noqa: NPY002 (the generator that cma uses)
+        return asked[:, :2] - 0.5
+
+    planner = EvolutionPlanner(land, NearestHopPlanner(stretches, land(stretches)), EvolutionConfig(evaluations=24))
+    answers = []
+    for seed in (3, 4):
+        drawn = np.random.RandomState(seed).rand(4)
+        np.random.seed(seed)  # noqa: NPY002
+        noise.clear()
+        answers.append(planner.predict(targets)[0])
+        assert [*noise, np.random.rand()] == drawn.tolist()  # noqa: NPY002
+    assert np.array_equal(*answers)
+
+
+def test_evolution_answers_with_its_start_where_every_hop_fails() -> None:
+    pytest.importorskip("cma")
+    stretches, targets = sample_stretches(20, 0), np.array([(0.1, 0.0), (-0.2, 0.1)])
+    start = NearestHopPlanner(stretches, stretches[:, :2] - 0.5)
+    planner = EvolutionPlanner(lambda asked: np.full((len(asked), 2), np.nan), start, EvolutionConfig(evaluations=24))
+    assert np.array_equal(planner.predict(targets)[0], start.predict(targets)[0])
+    assert planner.calls == 48
+
+
 def test_nearest_hop_is_the_nearest() -> None:
     stretches = sample_stretches(50, 0)
     landings = np.random.default_rng(0).normal(size=(50, 2))

@@ -32,8 +32,29 @@ class EvolutionConfig:
             )
 
 
+class NumpyStream:
+    """NumPy's global random numbers, which ``cma`` seeds and draws from: inside ``with`` ours, outside as the user left them."""
+
+    def __init__(self) -> None:
+        self.inside: Any = None
+        self.outside: Any = None
+
+    def __enter__(self) -> None:
+        self.outside = np.random.get_state()  # noqa: NPY002 (the generator that cma uses)
+        if self.inside is not None:
+            np.random.set_state(self.inside)  # noqa: NPY002
+
+    def __exit__(self, *raised: object) -> None:
+        self.inside = np.random.get_state()  # noqa: NPY002
+        np.random.set_state(self.outside)  # noqa: NPY002
+
+
 class EvolutionPlanner:
-    """CMA-ES from another planner's answer; the searches of all targets advance together, so that hops form batches."""
+    """CMA-ES from another planner's answer; the searches of all targets advance together, so that hops form batches.
+
+    They draw in turn from one stream of random numbers, seeded anew for each batch: the same batch gets the same answers, but
+    a target's answer depends, a little, on which targets are asked with it.
+    """
 
     def __init__(self, land: Land, start: Planner, config: EvolutionConfig | None = None) -> None:
         self.land, self.start, self.config = land, start, config or EvolutionConfig()
@@ -45,17 +66,25 @@ class EvolutionPlanner:
     ) -> Prediction:
         """Targets (2,) or (n, 2) [m] to stretches (4,) or (n, 4): of all hops looked at, the nearest to each target."""
         targets = targets_of(observation)
-        searches = [self._search(first) for first in self.start.predict(targets)[0]]
-        best, least = np.stack([s.x0 for s in searches]), np.full(len(targets), np.inf)
+        starts = self.start.predict(targets)[0]
+        stream = NumpyStream()
+        with stream:
+            searches = [self._search(first) for first in starts]
+        # the start is the answer until a hop has landed: one that failed is none
+        best, least = np.clip(starts, *STRETCH_RANGE), np.full(len(targets), np.inf)
         for _ in range(self.config.evaluations // self.config.population):
-            asked = np.clip(np.array([s.ask() for s in searches]), *STRETCH_RANGE)  # (n, population, n_actuators)
+            with stream:
+                asked = np.clip(np.array([s.ask() for s in searches]), *STRETCH_RANGE)  # (n, population, n_actuators)
             landings = np.asarray(self.land(asked.reshape(-1, asked.shape[2]))).reshape(*asked.shape[:2], 2)
             self.calls += asked.shape[0] * asked.shape[1]
             error = np.linalg.norm(landings - targets[:, None], axis=2)
-            error = np.where(np.isfinite(error), error, 1e3)  # a failed hop is far from everything
-            for k, search in enumerate(searches):
-                search.tell(list(asked[k]), error[k].tolist())
-                winner = int(error[k].argmin())
+            landed = np.isfinite(error)
+            told = np.where(landed, error, 1e3)  # a failed hop is far from everything
+            with stream:
+                for search, stretches, found in zip(searches, asked, told, strict=True):
+                    search.tell(list(stretches), found.tolist())
+            error = np.where(landed, error, np.inf)
+            for k, winner in enumerate(error.argmin(axis=1)):
                 if error[k, winner] < least[k]:
                     best[k], least[k] = asked[k, winner], error[k, winner]
         return (best[0] if np.ndim(observation) == 1 else best), state
