@@ -13,7 +13,7 @@ import numpy as np
 
 from tensegrity_gym.batch import Progress
 from tensegrity_gym.design import Design
-from tensegrity_gym.errors import UnknownPresetError
+from tensegrity_gym.errors import InvalidParameterError, UnknownPresetError
 from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.formfinding import STRETCH_RANGE, Equilibria, form_find
 from tensegrity_gym.hops import HopResult, hop
@@ -80,6 +80,8 @@ class Calibration:
 
 def sample_stretches(n: int, seed: int, n_actuators: int = 4) -> Floats:
     """Sobol stretches over the range, shape (n, n_actuators)."""
+    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+        raise InvalidParameterError(f"stretches: expected an integer >= 1 of hops to draw them for, got {n!r}; ask for more hops")
     from scipy.stats import qmc  # heavy to import, and only calibration needs it
 
     low, high = STRETCH_RANGE

@@ -120,7 +120,7 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
         ``options={"target": (x, y)}`` [m] or one of "inside", "boundary", "beyond"; ``options={"scene": ...}``, a preset's
         name, a Scene, or a mapping of the values to fix. Info: ``target`` (2,) [m], ``reach`` [m], ``reachable``.
         """
-        super().reset(seed=seed)
+        super().reset(seed=plain_seed(seed))
         self._episode, self._running = self.task.draw(self.np_random, options), True
         self._viewer.wait(self._episode.target)
         return self._episode.observation.copy(), self._episode.info()
@@ -143,6 +143,11 @@ class TensegrityHopEnv(gym.Env[np.ndarray, np.ndarray]):
     def close(self) -> None:
         """Close the window, if there is one."""
         self._viewer.close()
+
+
+def plain_seed(seed: Any) -> Any:
+    """NumPy's integers as Python's, which are all that gymnasium takes for a seed; anything else as it is."""
+    return int(seed) if isinstance(seed, np.integer) else seed
 
 
 def show(viewer: Viewer) -> np.ndarray | list[np.ndarray] | None:

@@ -148,7 +148,7 @@ def form_find(
     Raises InvalidStretchesError and InvalidParameterError. What did not converge says so in ``converged``, and why in
     ``hints``; never use it.
     """
-    design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
+    design, scene, lattice = design or Design(), Scene.of(scene, "form_find"), lattice or Lattice()
     values = as_stretches(stretches, lattice, *(WIDEST_RANGE if outside else STRETCH_RANGE))
     if method not in METHODS:
         raise InvalidParameterError(f"form_find: expected method in {METHODS}, got {method!r}")

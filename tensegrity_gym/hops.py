@@ -122,11 +122,11 @@ def run(
     finite = np.isfinite(starts).all(axis=(1, 2, 3)) & np.isfinite(runaway)
     usable = usable & finite
     # a hop without a start is not simulated, but what is reported of it must be finite
-    spare = np.zeros_like(starts[:1])
+    spare = np.zeros((1, *starts.shape[1:]))
     spare[0, 0] = design.unloaded_positions(lattice)
     starts = np.where(finite[:, None, None, None], starts, spare)
     parts = []
-    for first in range(0, len(starts), CHUNK):
+    for first in range(0, max(1, len(starts)), CHUNK):  # no hops are one part too, of empty columns
         part = slice(first, first + CHUNK)
         records = follow(problem, starts[part], phase, usable[part], runaway[part], threads, progress)
         parts.append(measure(records, problem, lattice))

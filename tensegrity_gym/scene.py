@@ -68,6 +68,17 @@ class Scene:
             raise UnknownPresetError(f"Scene.preset: expected one of {sorted(cls.PRESETS)}, got {name!r}")
         return replace(cls(**cls.PRESETS[name]), **changes)  # type: ignore[arg-type]
 
+    @classmethod
+    def of(cls, scene: Any, caller: str) -> Scene:
+        """``scene``, or the default one for None; InvalidParameterError, in the name of ``caller``, for anything else."""
+        if scene is None:
+            return cls()
+        if not isinstance(scene, Scene):
+            known = isinstance(scene, str) and scene in cls.PRESETS
+            fix = f"use Scene.preset({scene!r})" if known else f"use Scene(...), or Scene.preset(name) of {sorted(cls.PRESETS)}"
+            raise InvalidParameterError(f"{caller}: expected scene to be a Scene or None, got {scene!r}; {fix}")
+        return scene
+
     @property
     def gravity_vector(self) -> Floats:
         """Gravity in the frame of the ground, whose normal is +z, shape (3,) [m/s^2]."""

@@ -52,7 +52,7 @@ def simulate(
 
     Raises InvalidStretchesError and InvalidParameterError.
     """
-    design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
+    design, scene, lattice = design or Design(), Scene.of(scene, "simulate"), lattice or Lattice()
     rate = 0.0 if trajectory_rate is None else positive("trajectory_rate", trajectory_rate)
     if fidelity == "auto":
         chosen = choose_fidelity(design, scene, lattice, tolerance)
@@ -117,7 +117,7 @@ def drop(
 
     Raises InvalidParameterError.
     """
-    design, scene, lattice = design or Design(), scene or Scene(), lattice or Lattice()
+    design, scene, lattice = design or Design(), Scene.of(scene, "drop"), lattice or Lattice()
     chosen = named_fidelity(fidelity)
     modelled = chosen.design(design)
     rows = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in (velocity, attitude, spin)]

@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from tensegrity_gym import task
 from tensegrity_gym.design import Design
-from tensegrity_gym.env import show
+from tensegrity_gym.env import plain_seed, show
 from tensegrity_gym.errors import InvalidParameterError, ResetNeededError
 from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.formfinding import STRETCH_RANGE
@@ -134,7 +134,7 @@ class TensegrityTravelEnv(gym.Env[np.ndarray, np.ndarray]):
 
         Info: ``goal``, ``position`` (2,) [m], ``heading`` [rad], ``distance``, ``reach`` [m], ``hops``.
         """
-        super().reset(seed=seed)
+        super().reset(seed=plain_seed(seed))
         unknown = sorted(set(options or {}) - {"goal"})
         if unknown:
             raise InvalidParameterError(f"reset options: expected keys out of ['goal'], got {unknown}")

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from tensegrity_gym import task
-from tensegrity_gym.env import HopTask
+from tensegrity_gym.env import HopTask, plain_seed
 from tensegrity_gym.errors import InvalidParameterError, ResetNeededError
 from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.scene import Scene
@@ -69,6 +69,7 @@ class TensegrityHopVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ``options``: as the single env's; "target" may also be one per env, shape (num_envs, 2) [m].
         """
         seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if _single(seed) else list(seed)  # type: ignore
+        seeds = [plain_seed(s) for s in seeds]
         if len(seeds) != self.num_envs:
             raise InvalidParameterError(f"seed: expected one, or {self.num_envs}, one per env, got {len(seeds)}")
         if not self._rngs:

@@ -122,6 +122,11 @@ def test_calibration_measures_what_a_model_costs_and_how_far_off_it_is() -> None
     assert {r.fidelity: r.error for r in first.rungs} == {r.fidelity: r.error for r in again.rungs}
 
 
+def test_a_calibration_on_no_hops_is_refused() -> None:
+    with pytest.raises(InvalidParameterError, match=r"expected an integer >= 1 of hops .* got 0"):
+        calibrate(Scene(), 0)
+
+
 def test_bars_that_never_buckle_may_be_single_springs() -> None:
     """Bars of 12 mm carry 80 times the load: the pilot offers one-spring bars; the default's do buckle, and it does not."""
     one = Lattice(1, 1)

@@ -31,6 +31,7 @@ from tensegrity_gym.errors import (
 from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.reachable import LANDINGS, measure_reach, reach_of, save_reach, stored_reach
 from tensegrity_gym.scene_ranges import SCENE_VALUES
+from tensegrity_gym.travel import TensegrityTravelEnv
 from tensegrity_gym.video import RecordVideo
 
 MIDDLE = np.full(4, 0.5, dtype=np.float32)
@@ -115,6 +116,11 @@ def test_seeds_fix_targets_and_scenes_exactly() -> None:
         np.testing.assert_array_equal(first, second)
         assert len({tuple(f) for f in first}) == 5
         assert not np.array_equal(one.reset(seed=8)[0], first[0])
+
+
+def test_numpys_integers_are_seeds_too() -> None:
+    for make in (TensegrityHopEnv, TensegrityTravelEnv):
+        np.testing.assert_array_equal(make().reset(seed=np.int64(3))[0], make().reset(seed=3)[0])
 
 
 def test_the_same_action_has_the_same_bits() -> None:
@@ -311,6 +317,12 @@ def test_reach_is_measured_and_saved(tmp_path: Path) -> None:
     np.testing.assert_allclose(symmetric, np.roll(symmetric[::-1], 1), rtol=1e-9)  # y to -y
     saved = json.loads(save_reach("earth", measured, 8, 0, tmp_path).read_text())
     assert saved["rest"]["radius"] == round(measured["rest"].radius, 5)
+
+
+@pytest.mark.parametrize("hops", [0, -1, 2.5])
+def test_a_reach_of_no_hops_is_refused(hops: Any) -> None:
+    with pytest.raises(InvalidParameterError, match=f"expected an integer >= 1 of hops .* got {hops}"):
+        measure_reach(Scene(), hops)
 
 
 def test_reaches_grow_as_gravity_shrinks() -> None:

@@ -6,8 +6,10 @@ magnitude (docs/physics.md), so only touchdown is compared where round-off enter
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import kernels
 import numpy as np
@@ -23,6 +25,7 @@ from tensegrity_gym import (
     InvalidStretchesError,
     Lattice,
     Scene,
+    drop,
     form_find,
     simulate,
 )
@@ -352,6 +355,29 @@ def test_bad_stretches_are_refused_before_anything_runs() -> None:
         simulate([0.3, 0.3, 0.3, 0.95])
     with pytest.raises(InvalidStretchesError, match=r"expected shape \(1,\)"):
         simulate(np.full(4, 0.3), lattice=Lattice(1, 1))
+
+
+@pytest.mark.parametrize("fidelity", ["paper", "flown"])
+def test_an_empty_batch_is_an_empty_result(fidelity: str) -> None:
+    r = simulate(np.empty((0, 4)), scene=Scene(duration=0.1), fidelity=fidelity, trajectory_rate=100.0)
+    assert (r.landing.shape, r.energies.shape, r.failed.shape) == ((0, 2), (0, 4, 7), (0,))
+    assert r.trajectory is not None
+    assert r.trajectory.positions.shape[0] == 0
+    assert r.describe_failures() == []
+
+
+@pytest.mark.parametrize(
+    ("scene", "fix"), [("earth", r"use Scene.preset\('earth'\)"), ("venus", r"of \['earth', "), ({"gravity": 9.8}, "use Scene")]
+)
+def test_scenes_that_are_none_are_refused_by_name(scene: Any, fix: str) -> None:
+    calls: dict[str, Callable[[], object]] = {
+        "simulate": lambda: simulate(STRETCHES[0], scene=scene),
+        "form_find": lambda: form_find(STRETCHES[0], scene=scene),
+        "drop": lambda: drop((0.0, 0.0, 0.0), scene=scene),
+    }
+    for name, call in calls.items():
+        with pytest.raises(InvalidParameterError, match=rf"{name}: expected scene to be a Scene or None, got .*{fix}"):
+            call()
 
 
 def test_other_lattices_hop() -> None:

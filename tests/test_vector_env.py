@@ -115,6 +115,12 @@ def test_seeds_fix_everything_and_unseeded_resets_go_on() -> None:
     assert (alone[[0, 2]] != first[[0, 2]]).any()
 
 
+def test_numpys_integers_are_seeds_too() -> None:
+    env = TensegrityHopVectorEnv(3)
+    for seed, same in ((np.int64(3), 3), (np.arange(3), [0, 1, 2])):
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], env.reset(seed=same)[0])  # type: ignore[arg-type]
+
+
 def test_options_go_to_all_envs_or_to_each() -> None:
     env = TensegrityHopVectorEnv(2, scene=SHORT, target="boundary")
     both = env.reset(options={"target": (0.1, 0.2)})[0]
