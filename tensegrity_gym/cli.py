@@ -55,12 +55,12 @@ def hop(
 
         from tensegrity_gym.render import filmstrip, whole_hop
 
-        Image.fromarray(filmstrip(whole_hop(result))).save(picture)
+        Image.fromarray(filmstrip(whole_hop(result), design=result.fidelity.design(Design()))).save(picture)
         print(f"picture: {picture}")
     if video is not None:
         from tensegrity_gym.render import record_hop
 
-        print(f"video: {record_hop(stretches, video, scene=where)}")
+        print(f"video: {record_hop(stretches, video, scene=where, fidelity=result.fidelity)}")
 
 
 def info() -> None:

@@ -18,6 +18,7 @@ from PIL import Image
 from tensegrity_gym.canvas import TRAIL, Camera, Canvas, colour_chart
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
+from tensegrity_gym.fidelity import Fidelity
 from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
@@ -155,6 +156,7 @@ def record_hop(
     scene: Scene | None = None,
     design: Design | None = None,
     lattice: Lattice | None = None,
+    fidelity: Fidelity | str = "paper",
     target: ArrayLike | None = None,
     fps: int = 30,
     speed: float = 0.5,
@@ -162,8 +164,8 @@ def record_hop(
 ) -> Path:
     """Simulate one hop and write it as ``.gif`` or ``.mp4`` (which needs the extra "video"); returns the path.
 
-    ``speed`` is real time over film time [-]: 0.5 is slow motion. ``target`` [m] is relative to the start. The camera
-    holds the whole hop in view.
+    ``fidelity`` is as for ``simulate``. ``speed`` is real time over film time [-]: 0.5 is slow motion. ``target`` [m] is
+    relative to the start. The camera holds the whole hop in view.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
@@ -172,7 +174,8 @@ def record_hop(
         raise InvalidParameterError(f"record_hop: expected fps > 0 and speed > 0, got {fps!r} and {speed!r}")
     scene, design, lattice = scene or Scene(), design or Design(), lattice or Lattice(2, 2)
     one = np.atleast_2d(np.asarray(stretches, dtype=float))[:1]
-    hop = simulate(one, scene=scene, design=design, lattice=lattice, trajectory_rate=fps / speed)
+    hop = simulate(one, scene=scene, design=design, lattice=lattice, fidelity=fidelity, trajectory_rate=fps / speed)
+    design = hop.fidelity.design(design)  # what was simulated may have fewer masses
     trajectory = whole_hop(hop)
     if target is not None:  # targets are relative to where the centre of mass started
         start = trajectory.positions[0, :1]

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tensegrity_gym import Design, Lattice, Scene, form_find, simulate
+from tensegrity_gym import Design, Fidelity, Lattice, Scene, form_find, render, simulate
 from tensegrity_gym.canvas import BAR_COLOURS, CABLE_COLOURS, LIGHT, SLACK, Camera, Canvas, bar_curves, member_loads
+from tensegrity_gym.cli import main
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.hops import HopResult
+from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.render import choose_moments, draw_posture, filmstrip, hop_frames, record_hop, watching_camera, whole_hop
 
 LATTICE, DESIGN = Lattice(2, 2), Design()
@@ -178,6 +179,24 @@ def test_a_film_has_all_frames(suffix: str, tmp_path: Path) -> None:
     else:
         frames, _ = pytest.importorskip("imageio_ffmpeg").count_frames_and_secs(str(path))
         assert abs(frames - expected) <= 1
+
+
+def test_a_film_is_of_the_model_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the command line too; rests differ by centimetres between precisions, and other bars have fewer masses."""
+    filmed: list[Trajectory] = []
+
+    def noted(trajectory: Trajectory, **_: object) -> list[np.ndarray]:
+        filmed.append(trajectory)
+        return [np.zeros((8, 8, 3), dtype=np.uint8)] * 2
+
+    monkeypatch.setattr(render, "hop_frames", noted)
+    assert main(["hop", "--fidelity", "single", "--video", str(tmp_path / "hop.gif")]) == 0
+    expected = whole_hop(simulate([0.3] * 4, scene=Scene.preset("earth"), fidelity="single", trajectory_rate=60.0))
+    np.testing.assert_array_equal(filmed[0].positions, expected.positions)
+    monkeypatch.undo()
+    one = Fidelity(bar_segments=1)
+    path = record_hop([0.4] * 4, tmp_path / "one.gif", scene=Scene(duration=0.2), fidelity=one, fps=10, size=(120, 120))
+    assert path.exists()
 
 
 def test_what_cannot_be_drawn_is_refused_by_name(standing: np.ndarray, tmp_path: Path) -> None:
