@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -231,6 +232,30 @@ def test_what_plans_depend_on_is_in_their_record(folder: Path) -> None:
         done = set(again.stages.results) - set(again.stages.skipped)
         assert {"plans_0_16", "score_cma_0_16", "refine2_1_32", "latency"} <= done
         assert not [name for name in done if name.startswith(("net", "hops", "floor"))]
+
+
+@pytest.mark.parametrize(
+    ("name", "bad", "good"),
+    [
+        ("oracle", (1, -1), (0, 2)),
+        ("tries", ((0,), (8, -1)), ((), (1,))),
+        ("refine", ((0,), (4, 0)), ((), (1,))),
+        ("policy_seeds", ((0,), (3, 2, 0), ()), (None, (3,))),
+        ("policy_budgets", ((0,), (-100,)), (None, (), (100,))),
+        ("targets", (0, -1), (None, 1)),
+        ("tries_seeds", (-1,), (None, 0)),
+        ("bayes_seeds", (-1,), (None, 0)),
+        ("latencies", (-1,), (0,)),
+        ("search", (7,), (8,)),
+        ("updates", (0,), (1,)),
+    ],
+)
+def test_counts_that_mean_nothing_are_refused(name: str, bad: tuple[Any, ...], good: tuple[Any, ...]) -> None:
+    for value in bad:
+        with pytest.raises(InvalidParameterError, match=rf"^{name}: expected .* >= \d"):
+            CompareConfig(**{name: value})
+    for value in good:
+        CompareConfig(**{name: value})
 
 
 def test_data_of_another_physics_are_refused(tmp_path: Path, folder: Path) -> None:

@@ -101,18 +101,13 @@ class CompareConfig:
                 f"write: expected it without --hyperparameters, as the tables are of the committed ones, got both; copy "
                 f"{self.hyperparameters} to training/hyperparameters, or leave one of them out"
             )
-        counts = {"seeds": min(self.seeds, default=0), "perturbations": self.perturbations, "updates": self.updates}
-        for name, value in counts.items():
-            if value < 1:
-                raise InvalidParameterError(f"{name}: expected an integer >= 1, got {value}")
+        self._check_counts()
         if not self.budgets or min(self.budgets) < 8:
             raise InvalidParameterError(f"budgets: expected numbers >= 8, got {self.budgets}")
         each = {"seeds": (self.seeds, self.budgets), "policy_seeds": (self.seeds_of_policies, self.budgets_of_policies)}
         for name, (numbers, budgets) in each.items():
             if len(numbers) not in (1, len(budgets)):
                 raise InvalidParameterError(f"{name}: expected one number, or one for each of {budgets}, got {numbers}")
-        if self.bayes < 0:
-            raise InvalidParameterError(f"bayes: expected an integer >= 0, got {self.bayes}")
         if self.bayes and self.scene in VARIED:
             raise InvalidParameterError(
                 f"bayes: expected 0 where scenes vary, got {self.bayes}; leave it out, or choose one of the scenes {SCENES}"
@@ -120,6 +115,33 @@ class CompareConfig:
         strangers = sorted(set(self.algorithms) - set(ALGORITHMS))
         if strangers:
             raise InvalidParameterError(f"algorithms: expected some of {ALGORITHMS}, got {strangers}")
+
+    def _check_counts(self) -> None:
+        """Numbers of things, each with the least that means something; a negative one would cut lists short from behind."""
+        least = {
+            "seeds": (1, self.seeds or (0,)),
+            "policy_seeds": (1, self.seeds_of_policies or (0,)),
+            "policy_budgets": (1, self.budgets_of_policies),
+            "perturbations": (1, (self.perturbations,)),
+            "updates": (1, (self.updates,)),
+            "tries": (1, self.tries),
+            "refine": (1, self.refine),
+            "search": (8, (self.search,)),  # one generation of CMA-ES
+            "bayes": (0, (self.bayes,)),
+            "latencies": (0, (self.latencies,)),
+            "targets": (1, () if self.targets is None else (self.targets,)),
+            "tries_seeds": (0, () if self.tries_seeds is None else (self.tries_seeds,)),
+            "bayes_seeds": (0, () if self.bayes_seeds is None else (self.bayes_seeds,)),
+        }
+        for name, (bound, values) in least.items():
+            if min(values, default=bound) < bound:
+                raise InvalidParameterError(
+                    f"{name}: expected {'an integer' if len(values) == 1 else 'integers'} >= {bound}, got {min(values)}"
+                )
+        if self.oracle < 0 or self.oracle == 1:
+            raise InvalidParameterError(
+                f"oracle: expected 0, for none, or an integer >= 2, got {self.oracle}; CMA-ES compares hops"
+            )
 
     def shortened(self) -> CompareConfig:
         """The settings of ``quick``, in its own folder."""
