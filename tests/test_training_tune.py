@@ -96,12 +96,14 @@ def test_settings_are_judged_on_targets_that_are_not_registered(tmp_path: Path) 
     assert np.linalg.norm(targets[:, None] - read("earth", "touchdown")["inside"][None], axis=2).min() > 1e-5
 
 
-def test_impossible_searches_are_named() -> None:
+def test_impossible_searches_are_named(tmp_path: Path) -> None:
     for name in ("settings", "seeds", "finalists", "final_seeds", "targets"):
         with pytest.raises(InvalidParameterError, match=name):
             TuneConfig(**{name: 0})
+    with pytest.raises(InvalidParameterError, match="scenes vary"):
+        TuneConfig(scene="varied")
     with pytest.raises(InvalidParameterError, match="algorithm"):
-        _ = Search(TuneConfig(algorithm="dqn")).values
+        _ = Search(TuneConfig(out=tmp_path, algorithm="dqn")).values
 
 
 def test_a_comparison_takes_hyperparameters_from_a_folder(tmp_path: Path) -> None:
@@ -127,7 +129,10 @@ def test_a_comparison_takes_hyperparameters_from_a_folder(tmp_path: Path) -> Non
     # the committed ones are others
     assert policy(replace(small, hyperparameters=FOLDER)).stages.skipped == []
     assert policy(replace(small, hyperparameters=None)).stages.skipped == ["policy_sac_0_16", "score_sac_0_16"]
+    # what no policy could be trained with is refused at once
     with pytest.raises(DataFileError, match="TOML file"):
-        policy(replace(small, hyperparameters=tmp_path))
+        run.Comparison(replace(small, hyperparameters=tmp_path))
+    with pytest.raises(InvalidParameterError, match="the nearest that is fine"):
+        run.Comparison(replace(small, hyperparameters=None, algorithms=("sac", "ppo"), policy_budgets=(254,)))
     with pytest.raises(InvalidParameterError, match="committed ones"):
         CompareConfig(hyperparameters=FOLDER, write=True)

@@ -191,6 +191,10 @@ def _policy(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData,
     from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
 
     settings = PolicyConfig(calls=config.hops, seed=config.seed, updates=config.gradient_steps)
+    # its hops come some at a time, and it spends an eighth of them before it begins to learn
+    together = settings.together
+    learnt = [b for b in budgets if b == config.hops or b > config.hops / 8 + together]
+    budgets = sorted({-(-b // together) * together for b in learnt})
     path = stages.folder / "policy.safetensors"
 
     def work() -> Results:
@@ -211,10 +215,10 @@ def _policy(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData,
 def _evaluation(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData, budgets: list[int]) -> None:
     answers = dict(stages.results["plans"]) | {"policy": stages.results["policy"]["answers"]}
     hops = Hops(scene, {"fidelity": SCORED_BY[scene.landing]})
-    starts = {str(b): STARTS if b == config.hops else STARTS_BELOW[scene.landing] for b in budgets}
+    asked = [(method, budget) for method in METHODS for budget in answers[method]]
+    starts = {b: STARTS if b == str(config.hops) else STARTS_BELOW[scene.landing] for _, b in asked}
 
     def work() -> Results:
-        asked = [(method, budget) for method in METHODS for budget in answers[method]]
         total = len(held_out) * (1 + STARTS + sum(starts[budget] for _, budget in asked))
         scores: Results = {method: {} for method in METHODS}
         with tqdm(total=total, desc="simulating the answers", unit="hop", disable=not config.progress) as bar:

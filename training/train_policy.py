@@ -171,9 +171,7 @@ def train_policy(
     started = time.perf_counter()
     scenes = scene if isinstance(scene, SceneRanges) else SceneRanges(scene)
     scaling, envs = Scaling.of(scenes), config.together
-    values = hyperparameters(config.algorithm, config.hyperparameters)
-    if config.algorithm == "ppo":
-        check_rollout(config.calls, values["rollout"], lambda calls: replace(config, calls=calls).together)
+    values = check_calls(config)
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
     plain, told = asdict(config) | {"hyperparameters": values}, asdict(scenes if scenes.ranges else scenes.base)
@@ -202,6 +200,14 @@ def train_policy(
     card |= {"evaluations": watch.evaluations} if config.evaluate_every else {}
     seconds, simulating = watch.seconds()
     return watch.snapshots, card | {"seconds": seconds, "simulating_seconds": simulating}
+
+
+def check_calls(config: PolicyConfig) -> dict[str, Any]:
+    """The hyper-parameters that ``config`` means; InvalidParameterError for a number of calls that PPO cannot learn from."""
+    values = hyperparameters(config.algorithm, config.hyperparameters)
+    if config.algorithm == "ppo":
+        check_rollout(config.calls, values["rollout"], lambda calls: replace(config, calls=calls).together)
+    return values
 
 
 def _evaluation(

@@ -53,11 +53,14 @@ class Comparison:
         self.config = config
         if config.bayes:
             require_botorch()
-        if config.hyperparameters is not None:
-            from training.algorithms import hyperparameters  # stable-baselines3 takes seconds to import
+        if config.hyperparameters is not None or "ppo" in config.algorithms:
+            from training.train_policy import PolicyConfig, check_calls  # stable-baselines3 takes seconds to import
 
-            for algorithm in config.algorithms:  # refused now, not after all planners
-                hyperparameters(algorithm, self._source(algorithm))
+            for algorithm in config.algorithms:  # what no policy can learn from is refused now, not after all planners
+                for budget in config.budgets_of_policies:
+                    check_calls(
+                        PolicyConfig(algorithm, calls=budget, hyperparameters=self._source(algorithm), **self.policy_settings)
+                    )
         changes = {} if config.duration is None else {"duration": config.duration}
         self.scenes = registered.scenes_of(config.scene, config.landing, **changes)
         self.scene = self.scenes.base
