@@ -42,6 +42,7 @@ SMALL = PolicyConfig(calls=24, updates=1, envs=3, checkpoint_every=6)
 
 @pytest.mark.parametrize("algorithm", ["sac", "td3", "ppo"])
 def test_spends_its_budget_exactly_and_keeps_snapshots(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = train_policy(QUICK, PolicyConfig(algorithm, calls=8, updates=1, envs=4), progress=False)
     seen = {}
     build = module.build
     monkeypatch.setattr(module, "build", lambda *a: seen.setdefault("model", build(*a)))
@@ -52,6 +53,7 @@ def test_spends_its_budget_exactly_and_keeps_snapshots(algorithm: str, monkeypat
     targets = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
     theirs, _ = seen["model"].predict(actors[8].scaling(targets), deterministic=True)
     np.testing.assert_allclose(actors[8].predict(targets)[0], 0.5 + 0.3 * theirs, atol=1e-6)
+    np.testing.assert_array_equal(whole[8].predict(targets)[0], actors[8].predict(targets)[0])  # copies change no training
     if algorithm != "ppo":  # its one rollout of 8 hops is not yet over at 4
         assert not np.allclose(actors[4].predict(targets)[0], actors[8].predict(targets)[0])
 

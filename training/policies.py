@@ -53,7 +53,8 @@ class ActorPolicy:
             modules, squash = modules if isinstance(last, nn.Tanh) else [*modules, last], "tanh"
         _check_actor(model, modules, squash)
         found = [layer for layer in modules if isinstance(layer, nn.Linear)]
-        copy = _mlp([found[0].in_features, *(layer.out_features for layer in found)])
+        with torch.random.fork_rng(devices=[]):  # a copy made during training must draw none of its random numbers
+            copy = _mlp([found[0].in_features, *(layer.out_features for layer in found)])
         for mine, theirs in zip(list(copy)[::2], found, strict=True):
             mine.load_state_dict(theirs.state_dict())
         return cls(copy, scaling, squash)
