@@ -21,8 +21,9 @@ from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training import refine
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.hops import Hops
 from training.inverse import InverseConfig, InversePlanner, fit_energy
-from training.planner import BestOfPlanner, NearestHopPlanner, targets_of
+from training.planner import BestOfPlanner, NearestHopPlanner, targets_of, with_images
 from training.policies import ActorPolicy, _mlp
 from training.refine import RefiningPlanner
 from training.similarity import Scaling
@@ -457,6 +458,16 @@ def test_nearest_hop_counts_images_and_leaves_out_hops_without_a_landing() -> No
         NearestHopPlanner(stretches, np.full((3, 2), np.nan))
     with pytest.raises(InvalidParameterError, match="at least one"):
         planner.predict(np.empty((0, 2)))
+
+
+def test_images_land_where_the_simulator_says_that_they_do() -> None:
+    """A swapped stretch or a wrong sign would give the nearest-hop baseline, and the planners' starts, hops that nobody made."""
+    stretches = np.array([(0.25, 0.6, 0.4, 0.7), (0.5, 0.3, 0.65, 0.35)])
+    hops = Hops(Scene.preset("earth", landing="touchdown"), {"fidelity": "flown"})
+    images, landings = with_images(stretches, hops.land(stretches), small_net().landing_images)
+    assert len(np.unique(images, axis=0)) == 8
+    assert np.linalg.norm(landings, axis=1).min() > 0.01
+    np.testing.assert_allclose(hops.land(images), landings, atol=1e-3)  # equal but for rounding, which float32 lets grow
 
 
 def test_inverse_starts_from_images_and_sees_of_them_what_it_would() -> None:

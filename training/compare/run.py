@@ -16,6 +16,7 @@ from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
 from surrogate.model import HopNet, one_thread
+from surrogate.storage import CARD, POLICY_STATE, beside
 from tensegrity_gym.task import check_fidelity, reach
 from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import targets as registered
@@ -175,7 +176,7 @@ class Comparison:
             return {"seconds": card["seconds"]}
 
         settings = {"surrogate": asdict(config.surrogate), "updates": config.updates}
-        files = [path.name, path.with_suffix(".json").name]
+        files = [path.name, beside(path, CARD).name]
         self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{tag}"], files=files)
 
         def plan() -> Results:
@@ -281,7 +282,7 @@ class Comparison:
         )
 
         def work() -> Results:
-            state = path.with_suffix(".training")
+            state = beside(path, POLICY_STATE)
             actors, card = train_policy(self.scenes, settings, progress=self.config.progress, state=state)
             actors[budget].save(path, card)
             state.unlink(missing_ok=True)
@@ -298,7 +299,7 @@ class Comparison:
             "config": asdict(settings) | {"hyperparameters": None},
             "values": hyperparameters(algorithm, source),
         }
-        self.stages.run(name, content, work, files=[path.name, path.with_suffix(".json").name])
+        self.stages.run(name, content, work, files=[path.name, beside(path, CARD).name])
         self._score(algorithm, seed, budget, name, lambda: {"stretches": ActorPolicy.load(path).predict(self.targets)[0]})
 
     def _score(self, method: str, seed: int, budget: int, needs: str, answers: Callable[[], Any]) -> None:
