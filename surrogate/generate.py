@@ -19,7 +19,7 @@ from surrogate.hops import Configuration, HopData
 from surrogate.join import Piece, join, pieces_of
 from surrogate.sampling import read_stretches, sample_size, sample_stretches, stretches_hash
 from surrogate.schedule import Outcome, run_here, run_on_cluster
-from surrogate.storage import ensure_folder, remove_partials, writer_lock
+from surrogate.storage import beside_data, ensure_folder, remove_partials, writer_lock
 from tensegrity_gym import Design, Lattice, Scene
 from tensegrity_gym.auto import choose_fidelity
 from tensegrity_gym.errors import InvalidParameterError, SkippedChunksError
@@ -290,7 +290,7 @@ def main(config: GenerateConfig) -> None:
     paper = config.hops is None and config.first == 0 and configuration.sampler in ("sobol", "uniform")
     equilibria = config.equilibria or (4 * hops if paper else 0)
     if equilibria > hops:
-        beside = config.out.with_suffix(".equilibria.h5")
+        beside = beside_data(config.out, ".equilibria.h5")
         alone = replace(configuration, content="equilibria", trajectory="none")
         # form-finding takes a twentieth of a hop's time: larger chunks, as large in seconds
         run(beside, equilibria - hops, alone, first=config.first + hops, chunk=8 * config.chunk)

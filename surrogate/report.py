@@ -15,7 +15,7 @@ from surrogate import dataset
 from surrogate.floor import start_of
 from surrogate.hops import HopData, simulate_arguments
 from surrogate.scenes import comparable, unit_of
-from surrogate.storage import atomic_path, ensure_folder
+from surrogate.storage import atomic_path, beside_data, ensure_folder
 from tensegrity_gym import ENERGY_NAMES, HopStatus, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.events import flew
@@ -125,7 +125,7 @@ def report(path: Path, out: Path | None = None, floor: int = 0) -> Path:
         raise InvalidParameterError(f"floor: expected a file of one scene to measure it in, got scenes that vary in {path}")
     if not data.usable.any():
         raise DataFileError(f"{path}: expected at least one usable hop, got none of {len(data)}")
-    folder = ensure_folder(out or path.with_suffix(".report"))
+    folder = ensure_folder(out or beside_data(path, ".report"))
     usable = data.rows(data.usable)
     shown = comparable(usable) if varied else usable
     pictures = figures.PICTURES | (figures.VARIED if varied else {})

@@ -162,6 +162,13 @@ def beside(path: Path | str, ending: str) -> Path:
     return path.with_name(path.name.removesuffix(CHECKPOINT) + ending)
 
 
+def beside_data(path: Path | str, ending: str) -> Path:
+    """What lies beside file of hops ``path``: its name, without the .h5 or .hdf5 if it has one, and ``ending``."""
+    path = Path(path)
+    name = path.stem if path.suffix in (".h5", ".hdf5") else path.name  # hops_0.5 and hops_0.7 are two names
+    return path.with_name(name + ending)
+
+
 def read_sealed(path: Path | str) -> bytes:
     """The content that :func:`write_sealed` wrote; DataFileError where a single bit of the file is another."""
     try:

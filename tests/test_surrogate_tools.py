@@ -23,6 +23,7 @@ from surrogate.export import main as export
 from surrogate.merge import merge
 from surrogate.report import findings, report
 from surrogate.scenes import comparable
+from surrogate.storage import beside_data
 from tensegrity_gym import Scene, task
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 
@@ -221,3 +222,16 @@ def test_an_epoch_over_a_million_rows(tmp_path: Path) -> None:
     print(f"\n1e6 rows, {path.stat().st_size / 1e6:.0f} MB: read and checked in {read:.2f} s ({reading:.2f} s of CPU)")
     print(f"an epoch of shuffled batches: {epoch:.2f} s ({batching:.2f} s of CPU)")
     assert np.isfinite(total)
+
+
+@pytest.mark.parametrize(
+    ("file", "beside"),
+    [
+        ("hops.h5", "hops.report"),
+        ("hops.hdf5", "hops.report"),
+        ("hops_0.5", "hops_0.5.report"),
+        ("hops_0.5.h5", "hops_0.5.report"),
+    ],
+)
+def test_files_whose_names_hold_a_dot_share_nothing(file: str, beside: str) -> None:
+    assert beside_data(Path("runs") / file, ".report") == Path("runs") / beside
