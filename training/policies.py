@@ -20,24 +20,29 @@ from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training.planner import Prediction
 from training.similarity import Scaling
+from training.symmetry import Symmetry
 
-FORMAT = "tensegrity_gym.actor/3"
-
+FORMAT = "tensegrity_gym.actor/4"
+#: As the one before it, whose actors know no symmetry.
+FORMATS = ("tensegrity_gym.actor/3", FORMAT)
 
 #: How an actor's outputs are brought into [-1, 1].
 SQUASHES = {"tanh": torch.tanh, "clip": lambda x: torch.clamp(x, -1, 1)}
 
 
 class ActorPolicy:
-    """Deterministic actor: scaled observation through a ReLU MLP, into [-1, 1], then onto the range of stretches."""
+    """Deterministic actor: scaled observation through a ReLU MLP, into [-1, 1], then onto the range of stretches.
 
-    def __init__(self, layers: nn.Sequential, scaling: Scaling, squash: str = "tanh") -> None:
+    With a ``symmetry`` the target is folded first, and the stretches are unfolded (see ``Symmetry``).
+    """
+
+    def __init__(self, layers: nn.Sequential, scaling: Scaling, squash: str = "tanh", symmetry: Symmetry | None = None) -> None:
         self.layers = layers.eval()
-        self.scaling, self.squash = scaling, squash
+        self.scaling, self.squash, self.symmetry = scaling, squash, symmetry
 
     @classmethod
-    def from_model(cls, model: Any, scaling: Scaling) -> ActorPolicy:
-        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on observations of that ``scaling``.
+    def from_model(cls, model: Any, scaling: Scaling, symmetry: Symmetry | None = None) -> ActorPolicy:
+        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on such observations.
 
         Raises InvalidParameterError for a model whose actor is another function.
         """
@@ -57,7 +62,7 @@ class ActorPolicy:
             copy = _mlp([found[0].in_features, *(layer.out_features for layer in found)])
         for mine, theirs in zip(list(copy)[::2], found, strict=True):
             mine.load_state_dict(theirs.state_dict())
-        return cls(copy, scaling, squash)
+        return cls(copy, scaling, squash, symmetry)
 
     @torch.no_grad()
     def predict(
@@ -69,9 +74,14 @@ class ActorPolicy:
         if batch.ndim != 2 or batch.shape[1] != width or not np.isfinite(batch).all():
             raise InvalidParameterError(f"observation: expected finite numbers ({width},) or (n, {width}), got {observation!r}")
         low, high = STRETCH_RANGE
+        which = None
+        if self.symmetry is not None:
+            batch, which = self.symmetry.fold(batch)
         action = SQUASHES[self.squash](self.layers(torch.from_numpy(self.scaling(batch))))
         share = (action.numpy().astype(np.float64) + 1) / 2
         stretches = np.clip(low + (high - low) * share, low, high)
+        if self.symmetry is not None and which is not None:
+            stretches = self.symmetry.unfold(stretches, which)
         return (stretches[0] if np.ndim(observation) == 1 else stretches), state
 
     def save(self, path: Path | str, card: dict[str, Any]) -> Path:
@@ -87,6 +97,7 @@ class ActorPolicy:
             "model_version": MODEL_VERSION,
             "scaling": asdict(self.scaling),
             "squash": self.squash,
+            "symmetry": None if self.symmetry is None else asdict(self.symmetry),
             "sha256": hashlib.sha256(content).hexdigest(),
         }
         write_json(kept, card | fixed)
@@ -97,10 +108,10 @@ class ActorPolicy:
         """Read a saved actor; DataFileError for a missing, damaged or foreign one."""
         path = Path(path)
         card = read_json(beside(path, CARD))
-        for name, value in {"format": FORMAT, "model_version": MODEL_VERSION}.items():
+        for name, values in {"format": FORMATS, "model_version": (MODEL_VERSION,)}.items():
             came = card.get(name) if isinstance(card, dict) else None
-            if came != value:
-                raise DataFileError(f"{path}: expected an actor with {name} {value!r}, got {came!r}; train it again")
+            if came not in values:
+                raise DataFileError(f"{path}: expected an actor with {name} {values[-1]!r}, got {came!r}; train it again")
         try:
             content = path.read_bytes()
             if hashlib.sha256(content).hexdigest() != card["sha256"]:
@@ -111,8 +122,9 @@ class ActorPolicy:
             layers.load_state_dict(state)
             if card["squash"] not in SQUASHES:
                 raise ValueError(f"its card says squash {card['squash']!r}")
-            kept = card["scaling"]
-            return cls(layers, Scaling(tuple(kept["scale"]), tuple(kept["offset"]), kept["gravity"]), card["squash"])
+            kept, group = card["scaling"], card.get("symmetry")
+            symmetry = group and Symmetry(tuple(map(tuple, group["permutations"])), tuple(map(tuple, group["signs"])))
+            return cls(layers, Scaling(tuple(kept["scale"]), tuple(kept["offset"]), kept["gravity"]), card["squash"], symmetry)
         except (OSError, ValueError, KeyError, IndexError, TypeError, RuntimeError, SafetensorError) as error:
             raise DataFileError(f"{path}: expected a whole actor checkpoint ({error}); train it again") from error
 

@@ -15,6 +15,7 @@ from tensegrity_gym import Scene, simulate, task
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import HopStatus
 from training.similarity import Scaling
+from training.symmetry import FoldedTargets, Symmetry
 
 
 class ScaledObservation(gym.ObservationWrapper):
@@ -75,16 +76,25 @@ class BatchedHopVecEnv(DummyVecEnv):
     Targets, seeds, spaces and observations are the envs' own, rewards come from the same function that they call; only
     ``simulate`` is called once for all of them. Where scenes vary, the first env draws one for all at each reset, as the
     registered vector env does with ``shared_scene``. Infos hold ``landing`` (2,) [m], ``error`` [m] and ``status``.
-    ``levers``: further arguments of ``simulate``.
+    ``levers``: further arguments of ``simulate``; with a ``symmetry`` policies see folded targets, see ``FoldedTargets``.
     """
 
     def __init__(
-        self, scene: Scene | SceneRanges, scale: float | Scaling, envs: int, levers: Mapping[str, Any] | None = None
+        self,
+        scene: Scene | SceneRanges,
+        scale: float | Scaling,
+        envs: int,
+        levers: Mapping[str, Any] | None = None,
+        symmetry: Symmetry | None = None,
     ) -> None:
         first = make_env(scene, scale)
         varied = isinstance(scene, SceneRanges) and bool(scene.ranges)
-        makers: list[Callable[[], gym.Env]] = [lambda: first]
-        makers += [lambda: make_env(scene, scale, first if varied else None)] * (envs - 1)
+
+        def folded(env: gym.Env) -> gym.Env:
+            return env if symmetry is None else FoldedTargets(env, symmetry)
+
+        makers: list[Callable[[], gym.Env]] = [lambda: folded(first)]
+        makers += [lambda: folded(make_env(scene, scale, first if varied else None))] * (envs - 1)
         super().__init__(makers)
         self.levers = dict(levers or {})
         #: Hops simulated since the envs were made.
@@ -96,7 +106,8 @@ class BatchedHopVecEnv(DummyVecEnv):
         """Simulate one hop per env; every episode ends, and every env is reset."""
         plain: list[Any] = self.envs
         low, high = tensegrity_gym.STRETCH_RANGE  # float32 cannot hold them: cut the overshoot off, as the env does
-        stretches = np.stack([env.action(action) for env, action in zip(plain, self.actions, strict=True)]).astype(np.float64)
+        asked = [_stretches(env, action) for env, action in zip(plain, self.actions, strict=True)]
+        stretches = np.stack(asked).astype(np.float64)
         started = time.perf_counter()
         scene = plain[0].unwrapped.scene
         hop = simulate(np.clip(stretches, low, high), scene=scene, **self.levers)
@@ -121,6 +132,13 @@ class BatchedHopVecEnv(DummyVecEnv):
             return super().step_wait()
         finally:
             self.envs = plain
+
+
+def _stretches(env: Any, action: np.ndarray) -> np.ndarray:
+    """What the wrapped env gets of an action."""
+    while isinstance(env, gym.ActionWrapper):
+        env, action = env.env, env.action(action)
+    return action
 
 
 class _Stepped:

@@ -27,6 +27,7 @@ from training.algorithms import build, check_rollout, env_count, hyperparameters
 from training.policies import ActorPolicy
 from training.sb3_vec_env import BatchedHopVecEnv
 from training.similarity import Scaling
+from training.symmetry import Symmetry
 
 #: Added to the seed of the envs that a policy is evaluated in while it trains.
 EVALUATION_SEED = 2_000_003
@@ -49,6 +50,9 @@ class PolicyConfig:
     envs: int | None = None
     """Envs whose hops are simulated together, halved until they divide ``calls``, so that no hop is over budget; None: 16, or
     80 from 4000 hops on, whose batches keep the simulator's lanes busier."""
+    symmetric: bool = False
+    """Turn every target into one part of the plane by the symmetries of lattice and ground, and the answer back, so that the
+    policy learns a quadrant in place of the plane."""
     fidelity: str = "paper"
     """Model of the hop, one that the envs know by name: paper, single, flown, ..."""
     checkpoint_every: int = 512
@@ -98,6 +102,7 @@ class _Watch(BaseCallback):
         config: PolicyConfig,
         budgets: Sequence[int],
         scaling: Scaling,
+        symmetry: Symmetry | None,
         bar: tqdm,
         path: Path | None,
         settings: str,
@@ -105,7 +110,8 @@ class _Watch(BaseCallback):
         started: float,
     ):
         super().__init__()
-        self.config, self.budgets, self.scaling, self.bar = config, sorted(budgets), scaling, bar
+        self.config, self.budgets, self.bar = config, sorted(budgets), bar
+        self.scaling, self.symmetry = scaling, symmetry
         self.path, self.settings, self.written = path, settings, 0
         self.hops, self.started = hops, started
         self.before = self.simulated_before = 0.0  # seconds that earlier runs took
@@ -137,7 +143,7 @@ class _Watch(BaseCallback):
         """Copy the actor if a budget is spent that has no copy yet."""
         for budget in self.budgets:
             if self.model.num_timesteps >= budget and budget not in self.snapshots:
-                self.snapshots[budget] = ActorPolicy.from_model(self.model, self.scaling)
+                self.snapshots[budget] = ActorPolicy.from_model(self.model, self.scaling, self.symmetry)
 
     def resume(self, model: Any, past: checkpoint.Past) -> None:
         """Go on from a checkpoint."""
@@ -145,7 +151,7 @@ class _Watch(BaseCallback):
         self.bar.update(model.num_timesteps)
         self.before, self.simulated_before = past.seconds, past.simulating
         for budget, weights in past.actors.items():
-            self.snapshots[budget] = ActorPolicy.from_model(model, self.scaling)
+            self.snapshots[budget] = ActorPolicy.from_model(model, self.scaling, self.symmetry)
             self.snapshots[budget].layers.load_state_dict(weights)
 
 
@@ -171,13 +177,14 @@ def train_policy(
     started = time.perf_counter()
     scenes = scene if isinstance(scene, SceneRanges) else SceneRanges(scene)
     scaling, envs = Scaling.of(scenes), config.together
+    symmetry = Symmetry.of(scenes) if config.symmetric else None
     values = check_calls(config)
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
     plain, told = asdict(config) | {"hyperparameters": values}, asdict(scenes if scenes.ranges else scenes.base)
     settings = hash_of({"config": plain, "scene": told, "budgets": sorted(budgets)})
     with contextlib.ExitStack() as stack:
-        hops = BatchedHopVecEnv(scenes, scaling, envs, check_fidelity(config.fidelity))
+        hops = BatchedHopVecEnv(scenes, scaling, envs, check_fidelity(config.fidelity), symmetry)
         venv = stack.enter_context(contextlib.closing(VecMonitor(hops)))
         bar = stack.enter_context(
             tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
@@ -185,14 +192,14 @@ def train_policy(
         model = build(config.algorithm, values, venv, config.calls, config.seed, tensorboard)
         if tensorboard is None:
             model.set_logger(Logger(None, []))  # its own would leave an empty folder in the system's for temporary files
-        watch = _Watch(config, [*budgets, config.calls], scaling, bar, state, settings, hops, started)
+        watch = _Watch(config, [*budgets, config.calls], scaling, symmetry, bar, state, settings, hops, started)
         before = 0
         if state is not None and state.exists():
             watch.resume(model, checkpoint.restore(state, model, venv, settings))
             before = model.num_timesteps
         callbacks: list[BaseCallback] = [watch]
         if config.evaluate_every:
-            callbacks.append(_evaluation(stack, scenes, scaling, config, watch.evaluations))
+            callbacks.append(_evaluation(stack, scenes, scaling, symmetry, config, watch.evaluations))
         model.learn(config.calls - before, callback=CallbackList(callbacks), reset_num_timesteps=before == 0)
         watch.keep()
         calls = before + hops.simulator_calls
@@ -211,9 +218,14 @@ def check_calls(config: PolicyConfig) -> dict[str, Any]:
 
 
 def _evaluation(
-    stack: contextlib.ExitStack, scenes: SceneRanges, scaling: Scaling, config: PolicyConfig, found: list[dict[str, float]]
+    stack: contextlib.ExitStack,
+    scenes: SceneRanges,
+    scaling: Scaling,
+    symmetry: Symmetry | None,
+    config: PolicyConfig,
+    found: list[dict[str, float]],
 ) -> EvalCallback:
-    venv = BatchedHopVecEnv(scenes, scaling, 16, check_fidelity(config.fidelity))
+    venv = BatchedHopVecEnv(scenes, scaling, 16, check_fidelity(config.fidelity), symmetry)
     venv.seed(config.seed + EVALUATION_SEED)
     monitored = stack.enter_context(contextlib.closing(VecMonitor(venv)))
     every = max(1, config.evaluate_every // config.together)

@@ -39,6 +39,8 @@ class CompareConfig:
     """Training seeds of the planners: one number, or one for each budget."""
     algorithms: tuple[str, ...] = ALGORITHMS
     """Policies to train."""
+    symmetric: tuple[str, ...] = ()
+    """Policies to train that know the symmetries of lattice and ground, as planners do (see training/symmetry.py)."""
     policy_budgets: tuple[int, ...] | None = None
     """Budgets of the policies; None: the same."""
     policy_seeds: tuple[int, ...] | None = None
@@ -112,9 +114,10 @@ class CompareConfig:
             raise InvalidParameterError(
                 f"bayes: expected 0 where scenes vary, got {self.bayes}; leave it out, or choose one of the scenes {SCENES}"
             )
-        strangers = sorted(set(self.algorithms) - set(ALGORITHMS))
-        if strangers:
-            raise InvalidParameterError(f"algorithms: expected some of {ALGORITHMS}, got {strangers}")
+        for name in ("algorithms", "symmetric"):
+            strangers = sorted(set(getattr(self, name)) - set(ALGORITHMS))
+            if strangers:
+                raise InvalidParameterError(f"{name}: expected some of {ALGORITHMS}, got {strangers}")
 
     def _check_counts(self) -> None:
         """Numbers of things, each with the least that means something; a negative one would cut lists short from behind."""
@@ -156,6 +159,7 @@ class CompareConfig:
             policy_seeds=None,
             policy_budgets=None,
             algorithms=("sac",),
+            symmetric=self.symmetric[:1],
             targets=2,
             perturbations=2,
             tries=(2,),
@@ -178,6 +182,11 @@ class CompareConfig:
     def seeds_of_policies(self) -> tuple[int, ...]:
         """Training seeds of the policies."""
         return self.seeds if self.policy_seeds is None else self.policy_seeds
+
+    @property
+    def policies(self) -> dict[str, tuple[str, bool]]:
+        """Policies by the names of their methods: the algorithm, and whether it knows the symmetries."""
+        return {a: (a, False) for a in self.algorithms} | {f"{a}_symmetric": (a, True) for a in self.symmetric}
 
     @property
     def planner_runs(self) -> list[tuple[int, int]]:

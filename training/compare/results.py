@@ -21,8 +21,11 @@ LABELS = {
     "tandem": "tandem net",
     "cma": "CMA-ES on the surrogate",
     "sac": "SAC",
+    "sac_symmetric": "SAC, knowing the symmetry",
     "td3": "TD3",
+    "td3_symmetric": "TD3, knowing the symmetry",
     "ppo": "PPO",
+    "ppo_symmetric": "PPO, knowing the symmetry",
 }
 
 

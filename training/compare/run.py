@@ -54,10 +54,11 @@ class Comparison:
         self.config = config
         if config.bayes:
             require_botorch()
-        if config.hyperparameters is not None or "ppo" in config.algorithms:
+        learning = {algorithm for algorithm, _ in config.policies.values()}
+        if config.hyperparameters is not None or "ppo" in learning:
             from training.train_policy import PolicyConfig, check_calls  # stable-baselines3 takes seconds to import
 
-            for algorithm in config.algorithms:  # what no policy can learn from is refused now, not after all planners
+            for algorithm in learning:  # what no policy can learn from is refused now, not after all planners
                 for budget in config.budgets_of_policies:
                     check_calls(
                         PolicyConfig(algorithm, calls=budget, hyperparameters=self._source(algorithm), **self.policy_settings)
@@ -102,8 +103,8 @@ class Comparison:
                 self._bayesian(seed, budget)
         self._oracle()
         for seed, budget in config.policy_runs:
-            for algorithm in config.algorithms:
-                self._policy(algorithm, seed, budget)
+            for method in config.policies:
+                self._policy(method, seed, budget)
         if config.latencies:
             self._latency()
 
@@ -271,14 +272,21 @@ class Comparison:
         """The file of an algorithm's hyper-parameters, None for the committed one."""
         return self.config.hyperparameters and self.config.hyperparameters / f"{algorithm}.toml"
 
-    def _policy(self, algorithm: str, seed: int, budget: int) -> None:
+    def _policy(self, method: str, seed: int, budget: int) -> None:
         from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
 
-        name = f"policy_{algorithm}_{seed}_{budget}"
+        algorithm, symmetric = self.config.policies[method]
+        name = f"policy_{method}_{seed}_{budget}"
         path = self.stages.folder / f"{name}.safetensors"
         source = self._source(algorithm)
         settings = PolicyConfig(
-            algorithm, calls=budget, seed=seed, fidelity=self.config.fidelity, hyperparameters=source, **self.policy_settings
+            algorithm,
+            calls=budget,
+            seed=seed,
+            symmetric=symmetric,
+            fidelity=self.config.fidelity,
+            hyperparameters=source,
+            **self.policy_settings,
         )
 
         def work() -> Results:
@@ -294,13 +302,11 @@ class Comparison:
 
         from training.algorithms import hyperparameters
 
-        # what stands in the file counts, not where it lies
-        content = self.base | {
-            "config": asdict(settings) | {"hyperparameters": None},
-            "values": hyperparameters(algorithm, source),
-        }
+        # what stands in the file counts, not where it lies; policies from before some could know symmetries say nothing of them
+        told = {k: v for k, v in asdict(settings).items() if k != "symmetric" or v}
+        content = self.base | {"config": told | {"hyperparameters": None}, "values": hyperparameters(algorithm, source)}
         self.stages.run(name, content, work, files=[path.name, beside(path, CARD).name])
-        self._score(algorithm, seed, budget, name, lambda: {"stretches": ActorPolicy.load(path).predict(self.targets)[0]})
+        self._score(method, seed, budget, name, lambda: {"stretches": ActorPolicy.load(path).predict(self.targets)[0]})
 
     def _score(self, method: str, seed: int, budget: int, needs: str, answers: Callable[[], Any]) -> None:
         """Simulate the answers of a method, from their start and from moved ones."""
@@ -315,14 +321,14 @@ class Comparison:
 
     def _latency(self) -> None:
         budget = max(self.config.budgets)
-        policies = {a: f"policy_{a}_0_{max(self.config.budgets_of_policies)}" for a in self.config.algorithms}
+        policies = {m: f"policy_{m}_0_{max(self.config.budgets_of_policies)}" for m in self.config.policies}
 
         def work() -> Results:
             fitted = self.fitted(0, budget)
             asked: dict[str, Planner] = {name: fitted[name] for name in self.names}
             asked |= {f"best{t}": self._best(fitted, t) for t in self.config.tries}
             asked |= {f"{REFINED[s]}{t}": self._refining(fitted, s, t) for t in self.config.refine for s in self.starts}
-            asked |= {a: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for a, name in policies.items()}
+            asked |= {m: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for m, name in policies.items()}
             return {name: self._questions(planner, name) for name, planner in asked.items()}
 
         needs = [f"net_0_{budget}", *policies.values()]
