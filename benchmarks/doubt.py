@@ -1,5 +1,7 @@
 """What it brings a planner to weigh its doubt: the same nets and hops, inverted with and without, and with other doubts.
 
+And what it costs to prefer, of answers that it expects to err alike, the one that stores least energy.
+
 ``python -m benchmarks.doubt --out runs/doubt --fidelity flown --data runs/flown/earth.h5 --budgets 1000 10000 --seeds 3``, with
 options as of ``python -m training compare``, whose kept nets it uses where ``--out`` is a comparison's folder.
 """
@@ -23,6 +25,8 @@ from training.compare.statistics import interquartile_mean
 from training.inverse import InversePlanner
 from training.score import distances
 
+#: The planner that prefers no answer for the energy that it stores.
+LEAST_ERROR = "the planner, whatever the energy"
 Correction = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
@@ -69,33 +73,38 @@ def main(config: CompareConfig) -> None:
     comparison.run()
     inside = comparison.places["inside"]
     found: dict[tuple[str, int], list[np.ndarray]] = {}
+    energies: dict[tuple[str, int], list[np.ndarray]] = {}
     for seed, budget in config.planner_runs:
         fitted = comparison.fitted(seed, budget)
         usual = fitted.inverse
         if usual.correction is None:
             continue  # too few hops to tell a scale
-        for name, correction in corrections(fitted.net, usual.correction, fitted.data["stretches"]).items():
-            stored = fitted.data["stretches"]
+        stored = fitted.data["stretches"]
+        choices = corrections(fitted.net, usual.correction, stored)
+        for name, correction in (choices | {LEAST_ERROR: usual.correction}).items():
             planner = InversePlanner(
                 fitted.landing,
                 config.inverse,
                 correction=correction,
-                energy=usual.energy,
+                energy=None if name == LEAST_ERROR else usual.energy,
                 stored=stored,
                 images=fitted.net.landing_images,
                 seed=seed,
             )
-            landings = comparison.hops.perturbed(planner.predict(inside)[0], config.perturbations)[:, 1:]
+            stretches = planner.predict(inside)[0]
+            landings = comparison.hops.perturbed(stretches, config.perturbations)[:, 1:]
             errors = distances(landings, inside, reach(comparison.scene)).mean(axis=1)
             apart = np.linalg.norm(landings - landings.mean(axis=1, keepdims=True), axis=2).mean(axis=1)
+            assert usual.energy is not None
             found.setdefault((name, budget), []).append(np.stack([errors, apart]))
-    print(f"{'':<56}{'error and scatter [mm] after':>30}")
-    print(f"{'':<56}" + "".join(f"{b:>18,}" for b in config.budgets))
+            energies.setdefault((name, budget), []).append(usual.energy(stretches))
+    print(f"{'':<56}{'error and scatter [mm], mean energy [J] after':>50}")
+    print(f"{'':<56}" + "".join(f"{b:>25,}" for b in config.budgets))
     for name in dict.fromkeys(name for name, _ in found):
         cells = []
         for budget in config.budgets:
             errors, apart = (1e3 * interquartile_mean(part) for part in np.stack(found[name, budget], axis=1))
-            cells.append(f"{errors:>9.3g} {apart:>8.2g}")
+            cells.append(f"{errors:>9.3g} {apart:>8.2g} {np.mean(energies[name, budget]):>6.1f}")
         print(f"{name:<56}" + "".join(cells))
 
 

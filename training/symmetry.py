@@ -29,12 +29,9 @@ class Symmetry:
     def of(cls, scenes: SceneRanges, lattice: Lattice | None = None) -> Symmetry:
         """Those that the lattice and all of the scenes share."""
         lattice, corners = lattice or Lattice(), scenes.corners()
-        if "slope_direction" in scenes.ranges:  # corners are two directions of many
-            keep = [0]
-        else:
-            downhill = np.array([corner.gravity_vector[:2] / corner.gravity for corner in corners])
-            moved = np.abs(lattice.symmetry_signs[:, None] * downhill - downhill)  # (g, corners, 2)
-            keep = np.flatnonzero((moved < 1e-12).all(axis=(1, 2))).tolist()
+        downhill = np.array([corner.gravity_vector[:2] / corner.gravity for corner in corners])
+        moved = np.abs(lattice.symmetry_signs[:, None] * downhill - downhill)  # (g, corners, 2)
+        keep = np.flatnonzero((moved < 1e-12).all(axis=(1, 2)))
         return cls(
             tuple(tuple(map(int, lattice.symmetries[k])) for k in keep),
             tuple((float(lattice.symmetry_signs[k, 0]), float(lattice.symmetry_signs[k, 1])) for k in keep),
