@@ -29,6 +29,8 @@ from training.compare.results import Outcome
 from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
 from training.hops import Hops, VariedHops, repeated
 from training.inverse import InversePlanner
+from training.policies import ActorPolicy
+from training.symmetry import Symmetry
 
 QUICK = Scene(duration=0.05)
 
@@ -117,7 +119,7 @@ def test_moved_starts_are_moved_by_what_is_said_and_the_first_not_at_all() -> No
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished quick comparison."""
     folder = tmp_path_factory.mktemp("compare")
-    run.main(CompareConfig(out=folder, quick=True, progress=False))
+    run.main(CompareConfig(out=folder, quick=True, symmetric=("sac",), progress=False))
     return folder / "quick"
 
 
@@ -127,6 +129,7 @@ def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Pa
         "nearest stored hop, 2 simulated in turn",
         "best of 2 simulated",
         "SAC | 0 | 2, 2 |",
+        "SAC, knowing the symmetry | 0 | 2, 2 |",
         "p95",
         "boundary",
         "fidelity flown",
@@ -137,7 +140,7 @@ def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Pa
     kept = json.loads((folder / "stages" / "score_ensemble_1_32.json").read_text())
     for lost in ("score_ensemble_1_32", "plans_1_32", "net_1_32"):
         (folder / "stages" / f"{lost}.json").unlink()
-    config = replace(CompareConfig(out=folder.parent, progress=False), quick=True).shortened()
+    config = replace(CompareConfig(out=folder.parent, symmetric=("sac",), progress=False), quick=True).shortened()
     again = run.Comparison(config)
     again.run()
     assert set(again.stages.results) - set(again.stages.skipped) == {"score_ensemble_1_32", "plans_1_32", "net_1_32"}
@@ -151,9 +154,23 @@ def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Pa
     np.testing.assert_allclose(outcome.errors("ensemble", 32)[1], wanted)
 
 
+def test_policies_that_know_the_symmetries_say_so_and_the_others_are_as_they_were(folder: Path) -> None:
+    told = {
+        name: json.loads((folder / "stages" / f"policy_{name}_0_16.json").read_text())["config"]["config"]
+        for name in ("sac", "sac_symmetric")
+    }
+    assert "symmetric" not in told["sac"]  # else all trained before there were others would be trained again
+    assert told["sac_symmetric"] == told["sac"] | {"symmetric": True}
+    signs = {name: ActorPolicy.load(folder / f"policy_{name}_0_16.safetensors").symmetry for name in told}
+    assert signs["sac"] is None
+    assert signs["sac_symmetric"] == Symmetry.of(scene_ranges("earth"))
+    with pytest.raises(InvalidParameterError, match=r"symmetric: expected some of"):
+        CompareConfig(symmetric=("a2c",))
+
+
 def test_scatter_is_about_the_answers_own_mean(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Landings with a known deviation, far off their targets: two starts tell as much of it as many."""
-    again = run.Comparison(CompareConfig(out=folder.parent, quick=True, progress=False).shortened())
+    again = run.Comparison(CompareConfig(out=folder.parent, quick=True, symmetric=("sac",), progress=False).shortened())
     again.run()
     outcome = Outcome(again)
     rng = np.random.default_rng(0)
