@@ -214,7 +214,7 @@ def test_sb3_learns_a_fixed_target_better_than_random(name: str, hops: int, envs
     sb3_vec_env = pytest.importorskip("training.sb3_vec_env")
     scene, target = Scene(duration=1.2, landing="touchdown"), (0.12, 0.06)
 
-    def make_env(scene: Scene, scale: float) -> gym.Env:
+    def make_env(scene: Scene, scale: float, leader: gym.Env | None = None) -> gym.Env:
         env = gym.make("TensegrityHop-v0", scene=scene, target=target)
         return sb3_vec_env.ScaledAction(sb3_vec_env.ScaledObservation(env, scale))
 
