@@ -122,9 +122,7 @@ class Configuration:
     @property
     def symmetries(self) -> tuple[Ints, Ints]:
         """Permutations (g, n_actuators) and signs (g, 2) that leave lattice and gravity as they are; the identity first."""
-        horizontal = self.scene.gravity_vector[:2]
-        keep = np.abs(self.lattice.symmetry_signs * horizontal - horizontal).max(axis=1) < 1e-12 * self.scene.gravity
-        return self.lattice.symmetries[keep], self.lattice.symmetry_signs[keep]
+        return self.lattice.symmetries_keeping(self.scene.gravity_vector[:2] / self.scene.gravity)
 
     @property
     def rows_per_hop(self) -> int:

@@ -64,9 +64,8 @@ def scene_symmetries(lattice: Lattice, scene: Scene, varied: Sequence[str] = ())
 
     Those of the lattice that leave gravity unmoved; all of them where the slope is an input, which then moves along.
     """
-    horizontal = np.zeros(2) if {"slope", "slope_direction"} & set(varied) else scene.gravity_vector[:2]
-    keep = np.abs(lattice.symmetry_signs * horizontal - horizontal).max(axis=1) < 1e-12 * scene.gravity
-    return lattice.symmetries[keep], lattice.symmetry_signs[keep]
+    turns_along = bool({"slope", "slope_direction"} & set(varied))
+    return lattice.symmetries_keeping(np.zeros(2) if turns_along else scene.gravity_vector[:2] / scene.gravity)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from functools import cached_property
 from itertools import permutations, product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.types import Floats, Ints
@@ -176,6 +177,15 @@ class Lattice:
     def symmetry_signs(self) -> Ints:
         """What each symmetry does to horizontal displacements: x -> sx x, y -> sy y, shape (n_symmetries, 2)."""
         return np.array([signs for signs, _ in self._symmetry_list], dtype=np.int64)
+
+    def symmetries_keeping(self, directions: ArrayLike) -> tuple[Ints, Ints]:
+        """Those of ``symmetries`` (g, n_cells) and ``symmetry_signs`` (g, 2) that leave horizontal directions as they are.
+
+        ``directions`` are of order one or zero, shape (2,) or (k, 2); the identity, which comes first, leaves all.
+        """
+        rows = np.atleast_2d(np.asarray(directions, dtype=np.float64))
+        keep = np.abs(self.symmetry_signs[:, None] * rows - rows).max(axis=(1, 2)) < 1e-12
+        return self.symmetries[keep], self.symmetry_signs[keep]
 
     @property
     def _symmetry_list(self) -> list[tuple[tuple[int, int], list[int]]]:

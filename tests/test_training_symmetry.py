@@ -65,7 +65,7 @@ def test_answers_to_mirrored_targets_are_mirrored() -> None:
 
 
 def test_what_answers_the_folded_target_lands_at_the_target_when_unfolded() -> None:
-    """The group's convention against the physics: one wrong sign or an inverse permutation lands elsewhere."""
+    """The group's convention against the physics: one wrong sign or swapped index lands elsewhere."""
     scene = Scene(landing="touchdown")
     answer = np.array((0.31, 0.52, 0.44, 0.67))  # to some folded target, the landing
     landing = simulate(answer, scene=scene).landing[0]

@@ -42,7 +42,9 @@ class ActorPolicy:
 
     @classmethod
     def from_model(cls, model: Any, scaling: Scaling, symmetry: Symmetry | None = None) -> ActorPolicy:
-        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU, trained on such observations.
+        """Copy the actor of a stable-baselines3 SAC, TD3 or PPO with ReLU.
+
+        It was trained on observations of that ``scaling``, of targets folded by that ``symmetry``.
 
         Raises InvalidParameterError for a model whose actor is another function.
         """
@@ -73,16 +75,18 @@ class ActorPolicy:
         width = self.layers[0].in_features
         if batch.ndim != 2 or batch.shape[1] != width or not np.isfinite(batch).all():
             raise InvalidParameterError(f"observation: expected finite numbers ({width},) or (n, {width}), got {observation!r}")
-        low, high = STRETCH_RANGE
-        which = None
-        if self.symmetry is not None:
-            batch, which = self.symmetry.fold(batch)
-        action = SQUASHES[self.squash](self.layers(torch.from_numpy(self.scaling(batch))))
-        share = (action.numpy().astype(np.float64) + 1) / 2
-        stretches = np.clip(low + (high - low) * share, low, high)
-        if self.symmetry is not None and which is not None:
-            stretches = self.symmetry.unfold(stretches, which)
+        if self.symmetry is None:
+            stretches = self._stretches(batch)
+        else:
+            folded, which = self.symmetry.fold(batch)
+            stretches = self.symmetry.unfold(self._stretches(folded), which)
         return (stretches[0] if np.ndim(observation) == 1 else stretches), state
+
+    def _stretches(self, seen: np.ndarray) -> np.ndarray:
+        low, high = STRETCH_RANGE
+        action = SQUASHES[self.squash](self.layers(torch.from_numpy(self.scaling(seen))))
+        share = (action.numpy().astype(np.float64) + 1) / 2
+        return np.clip(low + (high - low) * share, low, high)
 
     def save(self, path: Path | str, card: dict[str, Any]) -> Path:
         """Write weights (safetensors) and, beside them, the card with their checksum (.json)."""

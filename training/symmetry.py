@@ -28,14 +28,9 @@ class Symmetry:
     @classmethod
     def of(cls, scenes: SceneRanges, lattice: Lattice | None = None) -> Symmetry:
         """Those that the lattice and all of the scenes share."""
-        lattice, corners = lattice or Lattice(), scenes.corners()
-        downhill = np.array([corner.gravity_vector[:2] / corner.gravity for corner in corners])
-        moved = np.abs(lattice.symmetry_signs[:, None] * downhill - downhill)  # (g, corners, 2)
-        keep = np.flatnonzero((moved < 1e-12).all(axis=(1, 2)))
-        return cls(
-            tuple(tuple(map(int, lattice.symmetries[k])) for k in keep),
-            tuple((float(lattice.symmetry_signs[k, 0]), float(lattice.symmetry_signs[k, 1])) for k in keep),
-        )
+        horizontal = [corner.gravity_vector[:2] / corner.gravity for corner in scenes.corners()]
+        permutations, signs = (lattice or Lattice()).symmetries_keeping(horizontal)
+        return cls(tuple(map(tuple, permutations.tolist())), tuple((float(x), float(y)) for x, y in signs))
 
     def fold(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Observations (n, d), target first, with the image of their target that has the greatest x, then y; and which it is.
