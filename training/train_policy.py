@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from tqdm import tqdm
 
 import tensegrity_gym  # noqa: F401  registers the env
@@ -94,34 +94,31 @@ class _Evaluated(BaseCallback):
         return True
 
 
-class _Watch(BaseCallback):
-    """Moves the progress bar, copies the actor whenever a budget of simulator calls is spent, and writes checkpoints."""
+class _Clock:
+    """Seconds that a training has taken, over all its runs."""
 
-    def __init__(
-        self,
-        config: PolicyConfig,
-        budgets: Sequence[int],
-        scaling: Scaling,
-        symmetry: Symmetry | None,
-        bar: tqdm,
-        path: Path | None,
-        settings: str,
-        hops: BatchedHopVecEnv,
-        started: float,
-    ):
+    def __init__(self, hops: BatchedHopVecEnv) -> None:
+        self.hops, self.started = hops, time.perf_counter()
+        #: What earlier runs took, and of that what the simulator did [s].
+        self.before = (0.0, 0.0)
+
+    def seconds(self) -> tuple[float, float]:
+        """Wall time so far, and that in the simulator [s]."""
+        return self.before[0] + time.perf_counter() - self.started, self.before[1] + self.hops.seconds
+
+
+class _Watch(BaseCallback):
+    """Moves the progress bar and copies the actor whenever a budget of simulator calls is spent.
+
+    ``copy`` makes an actor of the model that is in training.
+    """
+
+    def __init__(self, budgets: Sequence[int], copy: Callable[[Any], ActorPolicy], bar: tqdm) -> None:
         super().__init__()
-        self.config, self.budgets, self.bar = config, sorted(budgets), bar
-        self.scaling, self.symmetry = scaling, symmetry
-        self.path, self.settings, self.written = path, settings, 0
-        self.hops, self.started = hops, started
-        self.before = self.simulated_before = 0.0  # seconds that earlier runs took
+        self.budgets, self.copy, self.bar = sorted(budgets), copy, bar
         self.snapshots: dict[int, ActorPolicy] = {}
         #: Hops so far and mean reward of each evaluation.
         self.evaluations: list[dict[str, float]] = []
-
-    def seconds(self) -> tuple[float, float]:
-        """Wall time of this training so far, and that in the simulator, over all its runs [s]."""
-        return self.before + time.perf_counter() - self.started, self.simulated_before + self.hops.seconds
 
     def _on_step(self) -> bool:
         self.bar.update(self.num_timesteps - self.bar.n)
@@ -133,26 +130,42 @@ class _Watch(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self.keep()  # training on the last hops is over when the next are collected
-        done = self.model.num_timesteps
-        if self.path is not None and done - self.written >= self.config.checkpoint_every:
-            actors = {budget: actor.layers.state_dict() for budget, actor in self.snapshots.items()}
-            checkpoint.save(self.path, self.model, self.settings, checkpoint.Past(actors, *self.seconds()))
-            self.written = done
 
     def keep(self) -> None:
         """Copy the actor if a budget is spent that has no copy yet."""
         for budget in self.budgets:
             if self.model.num_timesteps >= budget and budget not in self.snapshots:
-                self.snapshots[budget] = ActorPolicy.from_model(self.model, self.scaling, self.symmetry)
+                self.snapshots[budget] = self.copy(self.model)
 
-    def resume(self, model: Any, past: checkpoint.Past) -> None:
-        """Go on from a checkpoint."""
-        self.written = model.num_timesteps
-        self.bar.update(model.num_timesteps)
-        self.before, self.simulated_before = past.seconds, past.simulating
+
+class _Checkpoints(BaseCallback):
+    """Writes the training's state to ``path`` every so many hops, with the actors copied by ``watch``, which is called first."""
+
+    def __init__(self, path: Path, every: int, settings: str, watch: _Watch, clock: _Clock) -> None:
+        super().__init__()
+        self.path, self.every, self.settings, self.watch, self.clock = path, every, settings, watch, clock
+        self.written = 0
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        done = self.model.num_timesteps
+        if done - self.written >= self.every:
+            actors = {budget: actor.layers.state_dict() for budget, actor in self.watch.snapshots.items()}
+            checkpoint.save(self.path, self.model, self.settings, checkpoint.Past(actors, *self.clock.seconds()))
+            self.written = done
+
+    def resume(self, model: Any, venv: VecEnv) -> None:
+        """Go on from the file, if there is one."""
+        if not self.path.exists():
+            return
+        past = checkpoint.restore(self.path, model, venv, self.settings)
+        self.written, self.clock.before = model.num_timesteps, (past.seconds, past.simulating)
         for budget, weights in past.actors.items():
-            self.snapshots[budget] = ActorPolicy.from_model(model, self.scaling, self.symmetry)
-            self.snapshots[budget].layers.load_state_dict(weights)
+            self.watch.snapshots[budget] = self.watch.copy(model)
+            self.watch.snapshots[budget].layers.load_state_dict(weights)
+        self.watch.bar.update(model.num_timesteps)
 
 
 @one_thread()
@@ -174,7 +187,6 @@ def train_policy(
         raise InvalidParameterError(
             f"calls and budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}"
         )
-    started = time.perf_counter()
     scenes = scene if isinstance(scene, SceneRanges) else SceneRanges(scene)
     scaling, envs = Scaling.of(scenes), config.together
     symmetry = Symmetry.of(scenes) if config.symmetric else None
@@ -185,6 +197,7 @@ def train_policy(
     settings = hash_of({"config": plain, "scene": told, "budgets": sorted(budgets)})
     with contextlib.ExitStack() as stack:
         hops = BatchedHopVecEnv(scenes, scaling, envs, check_fidelity(config.fidelity), symmetry)
+        clock = _Clock(hops)
         venv = stack.enter_context(contextlib.closing(VecMonitor(hops)))
         bar = stack.enter_context(
             tqdm(total=config.calls, unit="hop", desc=f"policy ({config.algorithm})", disable=not progress, mininterval=0.5)
@@ -192,12 +205,13 @@ def train_policy(
         model = build(config.algorithm, values, venv, config.calls, config.seed, tensorboard)
         if tensorboard is None:
             model.set_logger(Logger(None, []))  # its own would leave an empty folder in the system's for temporary files
-        watch = _Watch(config, [*budgets, config.calls], scaling, symmetry, bar, state, settings, hops, started)
-        before = 0
-        if state is not None and state.exists():
-            watch.resume(model, checkpoint.restore(state, model, venv, settings))
-            before = model.num_timesteps
+        watch = _Watch([*budgets, config.calls], lambda trained: ActorPolicy.from_model(trained, scaling, symmetry), bar)
         callbacks: list[BaseCallback] = [watch]
+        if state is not None:
+            checkpoints = _Checkpoints(state, config.checkpoint_every, settings, watch, clock)
+            checkpoints.resume(model, venv)
+            callbacks.append(checkpoints)
+        before = model.num_timesteps
         if config.evaluate_every:
             callbacks.append(_evaluation(stack, scenes, scaling, symmetry, config, watch.evaluations))
         model.learn(config.calls - before, callback=CallbackList(callbacks), reset_num_timesteps=before == 0)
@@ -205,7 +219,7 @@ def train_policy(
         calls = before + hops.simulator_calls
     card = {"algorithm": config.algorithm.upper(), "train": plain, "scene": told, "simulator_calls": calls}
     card |= {"evaluations": watch.evaluations} if config.evaluate_every else {}
-    seconds, simulating = watch.seconds()
+    seconds, simulating = clock.seconds()
     return watch.snapshots, card | {"seconds": seconds, "simulating_seconds": simulating}
 
 
