@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training import tune
 from training.algorithms import FOLDER, hyperparameters
 from training.compare import run
 from training.compare.config import CompareConfig
 from training.compare.targets import read
-from training.train_policy import PolicyConfig
+from training.train_policy import PolicyConfig, train_policy
 from training.tune import Search, TuneConfig, choices, draw, write_toml
 
 
@@ -88,6 +89,18 @@ def test_settings_are_drawn_from_the_choices_and_written_whole(algorithm: str, t
         assert hyperparameters(algorithm, path) == values
         kept = {k for k in values if k not in among}
         assert {k: values[k] for k in kept} == {k: committed[k] for k in kept}
+
+
+@pytest.mark.parametrize(
+    "path", sorted(p for p in FOLDER.glob("*/*.toml") if p.parent.name != "choices"), ids=lambda p: p.parent.name
+)
+def test_committed_folders_of_hyperparameters_train_a_policy(path: Path) -> None:
+    values = hyperparameters(path.stem, path)
+    assert values != hyperparameters(path.stem)
+    config = PolicyConfig(path.stem, calls=16, hyperparameters=path)
+    actors, card = train_policy(Scene(duration=0.05), config, progress=False)
+    assert card["train"]["hyperparameters"] == values
+    assert [layer.out_features for layer in list(actors[16].layers)[::2]] == [*values["hidden"], 4]
 
 
 def test_settings_are_judged_on_targets_that_are_not_registered(tmp_path: Path) -> None:
