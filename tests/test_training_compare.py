@@ -154,6 +154,19 @@ def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Pa
     np.testing.assert_allclose(outcome.errors("ensemble", 32)[1], wanted)
 
 
+def test_records_of_policies_name_the_least_gradient_steps_only_where_these_bind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    comparison = run.Comparison(CompareConfig(out=tmp_path, progress=False))
+    told: dict[str, dict[str, Any]] = {}
+    monkeypatch.setattr(comparison.stages, "run", lambda name, content, *_, **__: told.update({name: content}))
+    for algorithm in ("sac", "td3", "ppo"):
+        for budget in (10_000, 20_000, 100_000):
+            comparison._policy(algorithm, 0, budget)
+    bound = {name for name, content in told.items() if "least_updates" in content}
+    assert bound == {"policy_sac_0_100000", "policy_td3_0_100000"}  # else all of fewer hops would be trained again
+
+
 def test_policies_that_know_the_symmetries_say_so_and_the_others_are_as_they_were(folder: Path) -> None:
     told = {
         name: json.loads((folder / "stages" / f"policy_{name}_0_16.json").read_text())["config"]["config"]

@@ -23,7 +23,7 @@ from tensegrity_gym.scene_ranges import scene_ranges
 from tensegrity_gym.task import reach
 from training import checkpoint
 from training import train_policy as module
-from training.algorithms import check_rollout, hyperparameters, rollout_of
+from training.algorithms import build, check_rollout, hyperparameters, rollout_of, updates_per_hop
 from training.compare.config import CompareConfig
 from training.compare.run import Comparison
 from training.inverse import InverseConfig, InversePlanner
@@ -216,6 +216,14 @@ def test_a_training_state_that_lacks_a_part_is_named(tmp_path: Path, unfinished:
     save_content(state, content)
     with pytest.raises(DataFileError, match=r"KeyError.*variables"):
         train_policy(QUICK, SMALL, progress=False, state=state)
+
+
+@pytest.mark.parametrize(("calls", "steps"), [(100, 4), (5000, 4), (10_000, 2), (20_000, 1), (40_000, 1), (100_000, 1)])
+def test_gradient_steps_are_capped_but_every_hop_has_one(calls: int, steps: int) -> None:
+    values = hyperparameters("sac")
+    assert updates_per_hop(values, calls) == steps
+    venv = BatchedHopVecEnv(QUICK, 0.5, 20)
+    assert build("sac", values, venv, calls, 0, None).gradient_steps == 20 * steps
 
 
 def test_hyperparameters_are_committed_files_and_strangers_are_named(tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ from tensegrity_gym.errors import DataFileError, InvalidParameterError
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"sac": SAC, "td3": TD3, "ppo": PPO}
 #: Hops of a rollout that stable-baselines3's PPO takes, at least: it normalises advantages.
 LEAST_ROLLOUT = 2
+#: Gradient steps per hop that no cap on all of them goes below: with a fifth of one, ten times the hops bring SAC nothing.
+LEAST_UPDATES = 1
 FOLDER = Path(__file__).parent / "hyperparameters"
 
 
@@ -54,9 +56,8 @@ def build(algorithm: str, values: Mapping[str, Any], venv: VecEnv, calls: int, s
         policy["log_std_init"] = values["log_std_init"]
         options |= {"n_steps": rollout // envs, "batch_size": max(2, rollout // parts if rollout % parts == 0 else rollout)}
     else:
-        per_hop = min(values["updates"], values["max_updates"] / calls)
         options |= {
-            "gradient_steps": max(1, round(per_hop * envs)),
+            "gradient_steps": max(1, round(updates_per_hop(values, calls) * envs)),
             "learning_starts": max(min(int(values["warmup"] * calls), values["most_warmup"]), envs),
             "buffer_size": calls,
         }
@@ -64,6 +65,11 @@ def build(algorithm: str, values: Mapping[str, Any], venv: VecEnv, calls: int, s
         size = venv.action_space.shape or ()
         options["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, values["action_noise"]))
     return ALGORITHMS[algorithm]("MlpPolicy", venv, policy_kwargs=policy, **options)
+
+
+def updates_per_hop(values: Mapping[str, Any], calls: int) -> float:
+    """Gradient steps per hop of sac and td3: as many as asked, at most ``max_updates`` in all, but one for each hop at least."""
+    return min(values["updates"], max(LEAST_UPDATES, values["max_updates"] / calls))
 
 
 def rollout_of(calls: int, envs: int, asked: int) -> int:

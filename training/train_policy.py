@@ -23,7 +23,7 @@ from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.task import check_fidelity
 from training import checkpoint
-from training.algorithms import build, check_rollout, env_count, hyperparameters
+from training.algorithms import build, check_rollout, env_count, hyperparameters, updates_per_hop
 from training.policies import ActorPolicy
 from training.sb3_vec_env import BatchedHopVecEnv
 from training.similarity import Scaling
@@ -194,7 +194,10 @@ def train_policy(
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
     plain, told = asdict(config) | {"hyperparameters": values}, asdict(scenes if scenes.ranges else scenes.base)
-    settings = hash_of({"config": plain, "scene": told, "budgets": sorted(budgets)})
+    decisive: dict[str, Any] = {"config": plain, "scene": told, "budgets": sorted(budgets)}
+    if "updates" in values:
+        decisive["updates_per_hop"] = updates_per_hop(values, config.calls)
+    settings = hash_of(decisive)
     with contextlib.ExitStack() as stack:
         hops = BatchedHopVecEnv(scenes, scaling, envs, check_fidelity(config.fidelity), symmetry)
         clock = _Clock(hops)
