@@ -23,7 +23,7 @@ from tensegrity_gym.scene_ranges import scene_ranges
 from tensegrity_gym.task import reach
 from training import checkpoint
 from training import train_policy as module
-from training.algorithms import build, check_rollout, hyperparameters, rollout_of, updates_per_hop
+from training.algorithms import build, check_rollout, hyperparameters, is_cap_passed, rollout_of, updates_per_hop
 from training.compare.config import CompareConfig
 from training.compare.run import Comparison
 from training.inverse import InverseConfig, InversePlanner
@@ -224,6 +224,13 @@ def test_gradient_steps_are_capped_but_every_hop_has_one(calls: int, steps: int)
     assert updates_per_hop(values, calls) == steps
     venv = BatchedHopVecEnv(QUICK, 0.5, 20)
     assert build("sac", values, venv, calls, 0, None).gradient_steps == 20 * steps
+
+
+def test_the_cap_is_passed_by_more_hops_than_it_has_steps_and_by_no_rounding() -> None:
+    values = hyperparameters("sac")
+    assert {calls for calls in range(1, 20_100) if is_cap_passed(values, calls)} == set(range(20_001, 20_100))
+    assert not is_cap_passed(values | {"updates": 0.2}, 100_000)
+    assert not is_cap_passed(hyperparameters("ppo"), 100_000)
 
 
 def test_hyperparameters_are_committed_files_and_strangers_are_named(tmp_path: Path) -> None:

@@ -72,6 +72,11 @@ def updates_per_hop(values: Mapping[str, Any], calls: int) -> float:
     return min(values["updates"], max(LEAST_UPDATES, values["max_updates"] / calls))
 
 
+def is_cap_passed(values: Mapping[str, Any], calls: int) -> bool:
+    """Whether one gradient step for each hop makes more of them than ``max_updates``; never so for ppo, which has no such cap."""
+    return "updates" in values and min(values["updates"], LEAST_UPDATES) * calls > values["max_updates"]
+
+
 def rollout_of(calls: int, envs: int, asked: int) -> int:
     """Hops of PPO's rollouts: whole steps of all envs, at most ``asked`` hops where a step has no more, that divide ``calls``."""
     return envs * _divisor(calls // envs, max(1, asked // envs))

@@ -300,13 +300,13 @@ class Comparison:
                 "values": card["train"]["hyperparameters"],
             }
 
-        from training.algorithms import LEAST_UPDATES, hyperparameters, updates_per_hop
+        from training.algorithms import LEAST_UPDATES, hyperparameters, is_cap_passed
 
         values = hyperparameters(algorithm, source)
         # what stands in the file counts, not where it lies; policies from before some could know symmetries say nothing of them
         told = {k: v for k, v in asdict(settings).items() if k != "symmetric" or v}
         content: dict[str, Any] = self.base | {"config": told | {"hyperparameters": None}, "values": values}
-        if "updates" in values and updates_per_hop(values, budget) * budget > values["max_updates"]:
+        if is_cap_passed(values, budget):
             content["least_updates"] = LEAST_UPDATES  # trained before there was a least, a policy of so many hops is another
         self.stages.run(name, content, work, files=[path.name, beside(path, CARD).name])
         self._score(method, seed, budget, name, lambda: {"stretches": ActorPolicy.load(path).predict(self.targets)[0]})
