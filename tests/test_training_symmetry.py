@@ -64,14 +64,16 @@ def test_answers_to_mirrored_targets_are_mirrored() -> None:
     np.testing.assert_allclose(policy.predict(asked[3])[0], answers[3], atol=1e-6)
 
 
-def test_what_answers_the_folded_target_lands_at_the_target_when_unfolded() -> None:
-    """The group's convention against the physics: one wrong sign or swapped index lands elsewhere."""
-    scene = Scene(landing="touchdown")
+@pytest.mark.parametrize("preset", ["earth", "slope"])
+def test_what_answers_the_folded_target_lands_at_the_target_when_unfolded(preset: str) -> None:
+    """The group's convention against the physics: one wrong sign, swapped index or, on a slope, axis lands elsewhere."""
+    scene = Scene.preset(preset, landing="touchdown")
+    group = Symmetry.of(SceneRanges(scene))
+    count = len(group.signs)
     answer = np.array((0.31, 0.52, 0.44, 0.67))  # to some folded target, the landing
     landing = simulate(answer, scene=scene).landing[0]
-    rows = np.arange(4)
-    landings = simulate(LEVEL.unfold(np.tile(answer, (4, 1)), rows), scene=scene).landing
-    np.testing.assert_allclose(landings * np.array(LEVEL.signs), np.tile(landing, (4, 1)), atol=2e-3)  # the floor, manifold
+    landings = simulate(group.unfold(np.tile(answer, (count, 1)), np.arange(count)), scene=scene).landing
+    np.testing.assert_allclose(landings * np.array(group.signs), np.tile(landing, (count, 1)), atol=2e-3)  # the floor, manifold
     assert np.abs(landing).min() > 5e-3
 
 
