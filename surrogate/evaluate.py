@@ -12,7 +12,7 @@ import tyro
 
 from surrogate import dataset, model
 from surrogate.dataset import SPLITS, HopData
-from surrogate.kriging import fit_process
+from surrogate.kriging import fit_process, without_images
 from surrogate.model import HopNet
 from surrogate.outputs import OUTPUTS, target_columns
 from surrogate.scores import LEVELS, PLANES, coverage, disagreement, nearest_hop_noise, of_data, ranking, rmse, speed, spread
@@ -39,6 +39,10 @@ class EvaluateConfig:
     """Train other nets on the same file, into --out: error against data size, widths and depths, the symmetry; resumable."""
     study_steps: int = 3000
     """Gradient steps of each of the studies' trainings (of one member each)."""
+
+    def __post_init__(self) -> None:
+        if self.floor < 0:
+            raise InvalidParameterError(f"floor: expected a number of hops >= 0, got {self.floor}; 0 leaves it out")
 
 
 @dataclass(frozen=True)
@@ -67,8 +71,9 @@ def mended(net: HopNet, rows: HopData, whole: HopData, shares: tuple[float, floa
     ``shares``: of validation and test hops, as the net was trained with. Empty where hops are too few.
     """
     found = {}
+    simulated = without_images(net, whole)
     for name, plane in PLANES.items():
-        data = whole.rows(whole.usable & np.isfinite(whole[name]).all(axis=1))
+        data = simulated.rows(simulated.usable & np.isfinite(simulated[name]).all(axis=1))
         images = net.permutations.numpy(), net.signs[:, plane].numpy().astype(np.float64)
         process = fit_process(data["stretches"], data[name] - _seen(net, data, plane), images, data.split(*shares), 0.0)
         if process is not None:

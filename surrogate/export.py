@@ -170,7 +170,8 @@ def main(config: ExportConfig) -> None:
     """Entry of ``python -m surrogate export``."""
     if config.out.exists():
         raise DataFileError(f"export: expected {config.out} not to be there yet, it is; choose another name")
-    dataset.read(config.file, content=None)  # nothing damaged is passed on
+    # nothing damaged is passed on, and equilibria are no episodes
+    dataset.read(config.file, content="hops" if config.minari else None)
     ensure_folder(config.out.parent)
     if config.minari:
         to_minari(config.file, config.out)

@@ -105,9 +105,11 @@ def generate(
     progress: bool = True,
     **options: Any,
 ) -> HopData:
-    """As :func:`fill`, and return the first ``hops`` hops."""
+    """As :func:`fill`, and return the first ``hops`` hops; of a file of more, with their share of its wall time."""
     fill(path, hops, configuration, chunk=chunk, threads=threads, progress=progress, **options)
-    return dataset.read(path, expect=configuration).rows(slice(0, hops * configuration.rows_per_hop))
+    data = dataset.read(path, expect=configuration)
+    found = data.rows(slice(0, hops * configuration.rows_per_hop))
+    return replace(found, seconds=data.seconds * len(found) / len(data))
 
 
 def fill(

@@ -92,6 +92,14 @@ def _distances(points: Floats, others: Floats) -> Floats:
     return np.sqrt(square)
 
 
+def without_images(net: HopNet, data: HopData) -> HopData:
+    """``data`` without stored images of hops, where ``net`` knows the symmetries, by which each hop gets its images back.
+
+    Kept, they would be there once for each symmetry: neighbours of a point would be a quarter as many, and say so of none.
+    """
+    return data.rows(data["image"] == 0) if len(net.permutations) > 1 else data
+
+
 @one_thread()
 @torch.no_grad()
 def fit_kriging(net: HopNet, data: HopData, validation: float, test: float, floor: float = 0.0) -> Kriging | None:
@@ -100,6 +108,7 @@ def fit_kriging(net: HopNet, data: HopData, validation: float, test: float, floo
     ``validation`` and ``test`` are the shares that the net was trained with, ``floor`` how far a landing moves, in each
     direction, when nothing but the unknowable changes [m].
     """
+    data = without_images(net, data)
     stretches = data["stretches"]
     residuals = data["landing"] - net.landing(torch.from_numpy(stretches.astype(np.float32))).mean(dim=0).numpy()
     return fit_process(stretches, residuals, net.landing_images, data.split(validation, test), floor)

@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -255,7 +255,8 @@ class HopNet(nn.Module):
         """Mean and standard deviation of hops, each (n, 9) [units of OUTPUTS]; refuses what no data covers.
 
         ``scene`` is needed where the training data varied it: a Scene, a mapping from ``scene_names`` to values (one, or n),
-        or an array (n, k). The deviation holds the predicted scatter of a hop and the members' disagreement.
+        or an array (n, k). A Scene must be the training data's in all else (but its duration). The deviation holds the
+        predicted scatter of a hop and the members' disagreement.
         """
         points, values = self._checked(stretches, scene)
         mean, variance = self.moments(points, values)
@@ -276,11 +277,25 @@ class HopNet(nn.Module):
                 f"expected stretches (n, {n_actuators}) in [{low}, {high}], where the surrogate was trained, got {stretches!r}"
             )
         points = torch.from_numpy(stretches).to(self.output_mean)
-        return points, self._checked_scene(scene, len(stretches)).to(points) if self.scene_names else None
+        if isinstance(scene, Scene):
+            scene = self._values_of(scene)
+        if not self.scene_names:
+            if scene is not None and np.size(scene if isinstance(scene, np.ndarray) else list(scene)):
+                raise InvalidParameterError(f"scene: expected no values, as the surrogate was trained in one, got {scene!r}")
+            return points, None
+        return points, self._checked_scene(scene, len(stretches)).to(points)
+
+    def _values_of(self, scene: Scene) -> dict[str, float]:
+        """What the net is told of a scene; InvalidParameterError where it differs in anything else from the one trained in."""
+        told = {name: getattr(scene, name) for name in self.scene_names}
+        still = {f.name for f in fields(Scene)} - {*told, "duration"}  # how long a hop is followed moves no landing
+        other = {n: (getattr(self.scene, n), getattr(scene, n)) for n in sorted(still)}
+        differ = [f"{n} {own!r}, got {came!r}" for n, (own, came) in other.items() if own != came]
+        if differ:
+            raise InvalidParameterError(f"scene: expected {'; '.join(differ)}, as the surrogate was trained; train one there")
+        return told
 
     def _checked_scene(self, scene: Any, n: int) -> Tensor:
-        if isinstance(scene, Scene):
-            scene = {name: getattr(scene, name) for name in self.scene_names}
         if isinstance(scene, Mapping) and set(scene) == set(self.scene_names):
             scene = np.column_stack([np.broadcast_to(np.asarray(scene[name], dtype=np.float64), n) for name in self.scene_names])
         try:

@@ -41,6 +41,10 @@ class ReportConfig:
     floor: int = 0
     """Measure the floor with so many of the hops, started 10 um off: what no model of the landing can do better than."""
 
+    def __post_init__(self) -> None:
+        if self.floor < 0:
+            raise InvalidParameterError(f"floor: expected a number of hops >= 0, got {self.floor}; 0 leaves it out")
+
 
 def findings(data: HopData) -> dict[str, str]:
     """What the hops say, in words and numbers."""

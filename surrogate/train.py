@@ -34,7 +34,8 @@ class TrainConfig:
     epochs: int = 2000
     """Most passes over the training hops."""
     steps: int = 12_000
-    """Most gradient steps; the learning rate falls to a hundredth over as many as there will be."""
+    """Most gradient steps, though never less than one pass over the hops; the learning rate falls to a hundredth over as many as
+    there will be."""
     patience: int = 300
     """Stop after so many passes without a better validation error."""
     batch: int = 512

@@ -20,6 +20,7 @@ from surrogate.model import OUTPUTS, HopNet, NetConfig
 from surrogate.outputs import LANDING
 from surrogate.scores import LEVELS, calibrate, coverage, of_data, rmse, spread
 from surrogate.storage import beside
+from surrogate.symmetry import with_images
 from surrogate.train import TrainCommand, TrainConfig, _start, train
 from surrogate.train import main as train_command
 from tensegrity_gym import Lattice, Scene, simulate
@@ -116,7 +117,10 @@ def test_correction_repeats_stored_hops_stays_equivariant_and_doubts_what_is_far
     assert fit_kriging(net, data.rows(slice(0, 1)), 0.1, 0.1) is None
     tested = data.rows(split["test"])
     left = np.linalg.norm(net.predict(tested["stretches"]).mean[:, LANDING] - tested["landing"], axis=1)
-    assert evaluate.mended(net, tested, data, (0.1, 0.1))["landing"]["rms"] < 0.5 * np.sqrt((left**2).mean())
+    alone = evaluate.mended(net, tested, data, (0.1, 0.1))
+    assert alone["landing"]["rms"] < 0.5 * np.sqrt((left**2).mean())
+    # stored images of hops are what the net's symmetries bring back by themselves
+    assert evaluate.mended(net, tested, with_images(data, Configuration(symmetry=True)), (0.1, 0.1)) == alone
     assert evaluate.mended(net, tested, data.rows(slice(0, 1)), (0.1, 0.1)) == {}
 
 
@@ -222,6 +226,24 @@ def test_net_is_equivariant_with_scenes_as_inputs_the_slope_turning_along(config
     asked = {"gravity": 9.80665, "friction": 0.4, "slope": np.radians(10), "slope_direction": [0.0, 0.0]}
     assert np.array_equal(net.predict(np.full((2, 4), 0.5), asked).mean, one)
     assert one.shape == (2, 9)
+    for other, said in (({"restitution": 0.5}, "restitution 0.0, got 0.5"), ({"landing": "touchdown"}, "landing 'rest', got")):
+        with pytest.raises(InvalidParameterError, match=said):
+            net.predict(np.full((2, 4), 0.5), Scene.preset("slope", friction=0.4, **other))
+    net.predict(np.full((2, 4), 0.5), Scene.preset("slope", friction=0.4, duration=9.0))
+
+
+def test_a_net_of_one_scene_answers_for_no_other() -> None:
+    net, points = HopNet(NetConfig(), LATTICE.symmetries, LATTICE.symmetry_signs), np.full((2, 4), 0.5)
+    same = net.predict(points).mean
+    for scene in (Scene(), Scene(duration=9.0), {}):
+        assert np.array_equal(net.predict(points, scene).mean, same)
+    for scene, said in (
+        (Scene.preset("moon"), "gravity 9.80665, got 1.625"),
+        ({"gravity": 9.80665}, "no values, as the surrogate was trained in one, got"),
+        (np.zeros((2, 1)), "no values"),
+    ):
+        with pytest.raises(InvalidParameterError, match=said):
+            net.predict(points, scene)
 
 
 def test_learns_how_landings_depend_on_a_varied_scene() -> None:

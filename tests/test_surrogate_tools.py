@@ -8,7 +8,9 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,10 +20,11 @@ from surrogate import dataset, generate
 from surrogate.check import check
 from surrogate.dataset import Configuration, HopData
 from surrogate.describe import describe
+from surrogate.evaluate import EvaluateConfig
 from surrogate.export import ExportConfig
 from surrogate.export import main as export
 from surrogate.merge import merge
-from surrogate.report import findings, report
+from surrogate.report import ReportConfig, findings, report
 from surrogate.scenes import comparable
 from surrogate.storage import beside_data
 from tensegrity_gym import Scene, task
@@ -126,6 +129,26 @@ def test_minari_plays_the_episodes_again(tmp_path: Path, ranges: dict[str, tuple
         np.testing.assert_array_equal(env.reset(options=options)[0], episode.observations[0])
         # actions and targets are float32, and a hop moves by 16 times (0.16 mm of 10 um) what its start does
         assert env.step(episode.actions[0])[1] == pytest.approx(episode.rewards[0], abs=1e-3)
+
+
+def test_equilibria_are_no_minari_episodes(tmp_path: Path) -> None:
+    generate.fill(tmp_path / "found.h5", 2, Configuration(content="equilibria"), progress=False)
+    with pytest.raises(DataFileError, match="expected a file of hops, got one of equilibria"):
+        export(ExportConfig(tmp_path / "found.h5", tmp_path / "hops-v0", minari=True))
+    assert not (tmp_path / "hops-v0").exists()
+
+
+@pytest.mark.parametrize("settings", [ReportConfig, lambda file, floor: EvaluateConfig(file, file, floor=floor)])
+def test_a_floor_of_less_than_no_hops_is_refused(settings: Callable[..., Any], hops: Path) -> None:
+    with pytest.raises(InvalidParameterError, match="floor: expected a number of hops >= 0, got -1"):
+        settings(hops, floor=-1)
+
+
+def test_time_of_hops_is_that_of_those_returned(hops: Path) -> None:
+    """A file may hold more of them than were asked for."""
+    data = dataset.read(hops)
+    some = generate.generate(hops, 6, CONFIGURATION, progress=False)
+    assert some.seconds == pytest.approx(data.seconds * 6 / len(data))
 
 
 def test_hops_that_no_env_makes_are_no_minari_episodes(tmp_path: Path) -> None:
