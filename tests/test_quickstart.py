@@ -94,6 +94,7 @@ def test_the_page_on_planning_runs(asked: tuple[Path, str], monkeypatch: pytest.
     said = run_lines(text, folder, {"--calls 512": "--calls 32", "--evaluate-every 128": "--evaluate-every 8 --envs 8"})
     assert shape(said) == shape(printed(text))
     monkeypatch.chdir(folder)
+    _write_varied(folder / "runs")
     names: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(compile(block, str(PLANNING), "exec"), names)
@@ -107,6 +108,20 @@ def test_the_page_on_planning_runs(asked: tuple[Path, str], monkeypatch: pytest.
     for flag in set(re.findall(r"`(--[a-z.-]+)", text)) - {"--planner.miss"}:
         fields = {*PlanCommand.__dataclass_fields__, *PolicyCommand.__dataclass_fields__}
         assert flag[2:].replace("-", "_") in fields, flag
+
+
+def _write_varied(folder: Path) -> None:
+    """A net and hops of a closed form whose scenes vary."""
+    from dataclasses import replace
+
+    from surrogate import dataset, model
+    from surrogate.train import train
+    from tests.test_surrogate_model import QUICK
+    from tests.test_training_plan import varied_data
+
+    path = dataset.write(folder / "varied.h5", varied_data(200))
+    net, card = train(dataset.read(path), replace(QUICK, epochs=2), progress=False)
+    model.save(net, folder / "varied_net.safetensors", card)
 
 
 def commands_of(text: str) -> list[list[str]]:

@@ -12,7 +12,9 @@ import pytest
 
 from surrogate import dataset, generate, model
 from surrogate.dataset import Configuration, HopData
+from surrogate.kriging import Kriging
 from surrogate.model import NetConfig
+from surrogate.symmetry import with_images
 from surrogate.train import train
 from tensegrity_gym import Design, HopStatus, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
@@ -22,7 +24,7 @@ from tests.test_surrogate_model import LATTICE, QUICK, closed_form_data
 from training import __main__ as command_line
 from training import plan
 from training.inverse import InverseConfig
-from training.plan import PlanCommand, ask, planner_of, simulator_of
+from training.plan import PlanCommand, ask, planner_of, simulator_of, varied_planner_of
 from training.similarity import alike_data
 
 POOL = InverseConfig(pool=512)
@@ -176,14 +178,20 @@ def test_simulated_hops_repeat_those_of_the_file_bit_by_bit(tmp_path: Path) -> N
         np.testing.assert_array_equal(simulator_of(data, at)(part["stretches"]), part["landing"])
 
 
-def test_hops_of_scenes_that_vary_are_planned_in_the_one_asked_for(tmp_path: Path) -> None:
-    """Landings go as one over gravity, whatever the friction."""
-    flat, rng = closed_form_data(1200), np.random.default_rng(0)
-    gravity, friction = rng.uniform(2.0, 8.0, 1200), rng.uniform(0.3, 0.8, 1200)
+VARYING = Configuration(scene_ranges={"gravity": (2.0, 8.0), "friction": (0.3, 0.8)})
+
+
+def varied_data(hops: int) -> HopData:
+    """Hops of the closed form whose landings go as one over gravity, whatever the friction."""
+    flat, rng = closed_form_data(hops), np.random.default_rng(0)
+    gravity, friction = rng.uniform(2.0, 8.0, hops), rng.uniform(0.3, 0.8, hops)
     columns = flat.columns | {"scene_gravity": gravity, "scene_friction": friction}
     columns["landing"] = flat["landing"] * 4.0 / gravity[:, None]
-    configuration = Configuration(scene_ranges={"gravity": (2.0, 8.0), "friction": (0.3, 0.8)})
-    data = HopData(columns, configuration.as_dict())
+    return HopData(columns, VARYING.as_dict())
+
+
+def test_hops_of_scenes_that_vary_are_planned_in_the_one_asked_for(tmp_path: Path) -> None:
+    data, flat, rng = varied_data(1200), closed_form_data(1200), np.random.default_rng(0)
     net, card = train(data, replace(QUICK, net=NetConfig(hidden=(32, 32), members=2), epochs=300), progress=False)
     targets = np.array([(0.1, 0.05), (-0.05, 0.1)])
     errors = []
@@ -193,6 +201,11 @@ def test_hops_of_scenes_that_vary_are_planned_in_the_one_asked_for(tmp_path: Pat
         assert plans.reachable.all()
         errors.append(np.linalg.norm(real(plans.stretches) * 4.0 / g - targets, axis=1))
     assert np.max(errors) < 0.02
+    # a planner of all scenes answers as that of each, whatever comes with it
+    seen = np.array([(*target, g, 0.5) for g in (2.5, 6.0) for target in targets])
+    of_all = varied_planner_of(net, card, data, config=POOL).predict(seen)[0]
+    found = np.linalg.norm(real(of_all) * 4.0 / seen[:, 2:3] - seen[:, :2], axis=1)
+    np.testing.assert_allclose(found, np.concatenate(errors), atol=1e-4)
     for at, said in (
         (None, "friction from 0.3 to 0.8"),
         ({"gravity": 3.0}, "friction in"),
@@ -200,12 +213,34 @@ def test_hops_of_scenes_that_vary_are_planned_in_the_one_asked_for(tmp_path: Pat
     ):
         with pytest.raises(InvalidParameterError, match=said):
             planner_of(net, card, data, at=at)
-    alike = alike_data(data, scene_ranges(dict(configuration.scene_ranges)))
-    net, card = train(alike, replace(QUICK, epochs=1), progress=False)
+    alike = alike_data(data, scene_ranges(dict(VARYING.scene_ranges)))
+    net, card = train(alike, replace(QUICK, net=NetConfig(hidden=(32, 32), members=2), epochs=100), progress=False)
+    answers = varied_planner_of(net, card, alike, config=POOL).predict(seen)[0]  # asked in metres all the same
+    assert np.linalg.norm(real(answers) * 4.0 / seen[:, 2:3] - seen[:, :2], axis=1).max() < 0.02
     with pytest.raises(DataFileError, match="expected lengths 'as on Earth'"):  # a net of the comparison, and a file in metres
         planner_of(net, card, data, at={"friction": 0.5, "gravity": 3.0})
-    tilted = replace(configuration, scene_ranges={"restitution": (0.0, 0.5)})
+    tilted = replace(VARYING, scene_ranges={"restitution": (0.0, 0.5)})
     bouncing = HopData(flat.columns | {"scene_restitution": rng.uniform(0.0, 0.5, 1200)}, tilted.as_dict())
     net, card = train(bouncing, replace(QUICK, epochs=1), progress=False)
     with pytest.raises(InvalidParameterError, match="restitution"):
         planner_of(net, card, bouncing, at={"restitution": 0.2})
+
+
+def test_planner_of_scenes_that_vary_wants_a_net_of_them(folder: Path) -> None:
+    net, card = model.load(folder / "net.safetensors")
+    with pytest.raises(InvalidParameterError, match="scenes that vary"):
+        varied_planner_of(net, card, dataset.read(folder / "hops.h5"))
+
+
+def test_stored_images_of_hops_are_remembered_once(folder: Path) -> None:
+    """A net that knows the symmetries brings images back by itself: a file that holds them plans as one that does not."""
+    net, card = model.load(folder / "net.safetensors")
+    data = dataset.read(folder / "hops.h5")
+    whole = with_images(data, Configuration(symmetry=True))
+    assert len(whole) == 4 * len(data)
+    plain, doubled = (planner_of(net, card, hops, config=POOL) for hops in (data, whole))
+    for planner in (plain, doubled):
+        assert isinstance(planner.correction, Kriging)
+    np.testing.assert_array_equal(doubled.pool, plain.pool)
+    np.testing.assert_array_equal(doubled.correction.stretches, plain.correction.stretches)
+    assert doubled.correction.scale == plain.correction.scale

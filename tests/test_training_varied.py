@@ -71,7 +71,7 @@ def planner_of(values: np.ndarray) -> InversePlanner:
 def test_recovers_the_inverse_of_a_throw_in_each_scene() -> None:
     observations, values = questions(24)
     observations[12:, 2:] = values[:12]  # two questions a scene, the second one perhaps beyond reach
-    planner = VariedPlanner(planner_of, VARIED)
+    planner = VariedPlanner(planner_of, VARIED, made_alike=True)
     stretches, state = planner.predict(observations)
     assert state is None
     assert missed(observations, stretches)[:12].max() < 1e-3
@@ -119,7 +119,7 @@ def test_nearest_of_many_scenes_weighs_what_a_scene_changes() -> None:
 @pytest.mark.parametrize("bad", [np.zeros(2), np.array((np.nan, 0.0, 3.0, 0.5)), np.zeros((2, 5))])
 def test_observations_without_their_scene_are_named(bad: np.ndarray) -> None:
     with pytest.raises(InvalidParameterError, match="gravity"):
-        VariedPlanner(planner_of, VARIED).predict(bad)
+        VariedPlanner(planner_of, VARIED, made_alike=True).predict(bad)
 
 
 def test_evolution_of_all_scenes_together_recovers_the_inverse_in_each() -> None:
@@ -132,7 +132,7 @@ def test_evolution_of_all_scenes_together_recovers_the_inverse_in_each() -> None
         return alike_throw(torch.from_numpy(stretches), torch.from_numpy(values)).numpy()
 
     stored, values = sample_stretches(500, 0), np.random.default_rng(2).uniform(*VARIED.bounds(), (500, 2))
-    start = VariedPlanner(NearestVariedHops(stored, land(stored, values), values, VARIED).at, VARIED)
+    start = VariedPlanner(NearestVariedHops(stored, land(stored, values), values, VARIED).at, VARIED, made_alike=True)
     looked.clear()
     stretches, _ = VariedEvolution(land, start, EvolutionConfig(evaluations=400), VARIED).predict(observations)
     assert missed(observations, stretches).max() < 1e-3

@@ -22,6 +22,9 @@ LEAST_VARIANCE = 1e-10
 DIFFERENCE = 1e-3
 #: Expected errors closer than this are the same [m].
 LEAST_EQUAL = 1e-4
+#: To add to the seed of the starts where hops may have been drawn with that seed: they are points of the same sequence, and
+#: starts already.
+START_SEED = 2_000_003
 #: Proposals differ in some stretch by at least this [-].
 DISTINCT = 0.01
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,19 +16,16 @@ from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.frozen import FrozenLanding
 from surrogate.hops import simulate_arguments
-from surrogate.kriging import fit_kriging
+from surrogate.kriging import fit_kriging, without_images
 from surrogate.model import HopNet, one_thread
 from tensegrity_gym import simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
-from training.inverse import InverseConfig, InversePlanner, fit_energy
+from training.inverse import START_SEED, InverseConfig, InversePlanner, fit_energy
 from training.planner import Land, targets_of
 from training.refine import RefiningPlanner
-from training.varied import VARIED_STARTS, fit_varied_kriging
-
-#: Added to the seed of the starts: hops of a file with that seed are points of the same sequence, and starts already.
-START_SEED = 2_000_003
+from training.varied import VARIED_STARTS, VariedPlanner, fit_varied_kriging
 
 
 @dataclass(frozen=True)
@@ -77,34 +74,85 @@ def planner_of(
 
     Raises DataFileError for hops of another configuration, InvalidParameterError for a scene that the net does not know.
     """
+    known, held, of_all = _known(net, card, data, seed, where)
+    _check_scene(net, at)
     config = config or InverseConfig()
+    if not at:
+        kriging = fit_kriging(net, known, held, 0.0, floor)
+        return InversePlanner(FrozenLanding(net), config, correction=kriging, stored=known["stretches"], **of_all)
+    scenes = _scenes(net)
+    return _maker(net, known, scenes, held, config, floor, of_all)(np.array([at[name] for name in scenes.observed]))
+
+
+@one_thread()
+def varied_planner_of(
+    net: HopNet,
+    card: Mapping[str, Any],
+    data: HopData,
+    *,
+    config: InverseConfig | None = None,
+    floor: float = 0.0,
+    seed: int = 0,
+    where: str = "data",
+) -> VariedPlanner:
+    """As :func:`planner_of` for many scenes at once: of the env's observations, target [m] and scene values, each has its own.
+
+    Hops whose lengths were made alike (``similarity.alike_data``), and the net that learnt from them, serve as well as those in
+    metres. Raises InvalidParameterError for a net that was trained in one scene.
+    """
+    if not net.scene_names:
+        raise InvalidParameterError(f"net: expected one trained on hops of scenes that vary, got one of {net.scene} alone")
+    known, held, of_all = _known(net, card, data, seed, where)
+    scenes = _scenes(net)
+    make = _maker(net, known, scenes, held, config or InverseConfig(), floor, of_all)
+    return VariedPlanner(make, scenes, made_alike="lengths" in data.configuration)
+
+
+def _known(net: HopNet, card: Mapping[str, Any], data: HopData, seed: int, where: str) -> tuple[HopData, float, dict[str, Any]]:
+    """Hops to remember, the share of them that tells how well others are mended, and what all planners of them have in common."""
     if not {"configuration", "train"} <= set(card):
         raise DataFileError(f"card: expected one that `python -m surrogate train` wrote, got {sorted(card)}; train the net again")
     model.check_data(card, data.configuration, where)
-    _check_scene(net, at)
     # the hops of the test split have no test to serve here: with those of validation they tell how well others are mended
     held = card["train"]["validation"] + card["train"]["test"]
-    known = data.rows(data.usable)
+    known = without_images(net, data.rows(data.usable))
     if not len(known):
         raise InvalidParameterError(f"{where}: expected at least one hop that did not fail, got none of {len(data)}")
-    stretches, energy = known["stretches"], fit_energy(known["stretches"], known["stored_energy"])
-    of_all: dict[str, Any] = {
-        "energy": energy,
+    of_all = {
+        "energy": fit_energy(known["stretches"], known["stored_energy"]),
         "images": net.landing_images,
-        "n_actuators": stretches.shape[1],
+        "n_actuators": known["stretches"].shape[1],
         "seed": seed + START_SEED,
     }
-    if not at:
-        kriging = fit_kriging(net, known, held, 0.0, floor)
-        return InversePlanner(FrozenLanding(net), config, correction=kriging, stored=stretches, **of_all)
-    scenes = SceneRanges(net.scene, {name: (low, high) for name, (low, high) in net.scene_ranges.items()})
-    landing, values = FrozenLanding(net, scenes.observed), np.array([at[name] for name in scenes.observed])
+    return known, held, of_all
+
+
+def _scenes(net: HopNet) -> SceneRanges:
+    return SceneRanges(net.scene, {name: (low, high) for name, (low, high) in net.scene_ranges.items()})
+
+
+def _maker(
+    net: HopNet,
+    known: HopData,
+    scenes: SceneRanges,
+    held: float,
+    config: InverseConfig,
+    floor: float,
+    of_all: Mapping[str, Any],
+) -> Callable[[Floats], InversePlanner]:
+    """Scene values in observed order (k,) [SI] to the planner of that scene; what all scenes share is fitted once."""
+    landing = FrozenLanding(net, scenes.observed)
     varied = fit_varied_kriging(net, known, scenes, known.split(held, 0.0), floor)
     settings = replace(config, starts=max(VARIED_STARTS, config.starts))
-    planner = InversePlanner(landing.at(values), settings, **of_all)
-    if varied is not None:
-        planner.correction = varied.at(values)
-    return planner
+
+    @one_thread()
+    def make(values: Floats) -> InversePlanner:
+        planner = InversePlanner(landing.at(values), settings, **of_all)
+        if varied is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
+            planner.correction = varied.at(values)
+        return planner
+
+    return make
 
 
 def _check_scene(net: HopNet, at: Mapping[str, float] | None) -> None:

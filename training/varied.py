@@ -1,6 +1,6 @@
 """Planners where scenes vary: each observation says which scene it is of, and a planner is made for that scene.
 
-All plan in lengths made alike (see ``similarity``), so that what is learnt in one gravity serves in another.
+Lengths made alike (see ``similarity``) let what is learnt in one gravity serve in another; most plan in them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from surrogate.model import HopNet, one_thread
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.planner import Images, NearestHopPlanner, Planner, Prediction, with_images
+from training.planner import Images, NearestHopPlanner, Planner, Prediction, targets_of, with_images
 from training.similarity import alike
 
 #: Neighbours of each hop that tell how its landing changes with stretches and scene.
@@ -33,11 +33,12 @@ VARIED_STARTS = 32
 class VariedPlanner:
     """Observations, target [m] and scene values, answered by a planner made anew for each scene that occurs among them.
 
-    ``make``: scene values (k,) [SI] to a planner of targets in that scene, as they would be on Earth [m].
+    ``make``: scene values (k,) [SI] to a planner of targets in that scene [m]; with ``made_alike`` its targets are as they
+    would be on Earth (see ``similarity``), which is what nets and hops that were made alike know.
     """
 
-    def __init__(self, make: Callable[[Floats], Any], scenes: SceneRanges) -> None:
-        self.make, self.scenes = make, scenes
+    def __init__(self, make: Callable[[Floats], Any], scenes: SceneRanges, *, made_alike: bool = False) -> None:
+        self.make, self.scenes, self.made_alike = make, scenes, made_alike
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -52,6 +53,8 @@ class VariedPlanner:
 
     def _asked(self, observations: np.ndarray, ask: Callable[[Any, Floats], np.ndarray]) -> np.ndarray:
         targets, values = alike(observations, self.scenes)
+        if not self.made_alike:
+            targets = targets_of(observations)
         distinct, which = np.unique(values, axis=0, return_inverse=True)
         rows = [np.flatnonzero(which.reshape(-1) == k) for k in range(len(distinct))]
         parts = [ask(self.make(scene), targets[row]) for scene, row in zip(distinct, rows, strict=True)]
