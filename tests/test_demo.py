@@ -19,7 +19,7 @@ from surrogate.train import TrainConfig
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, OutputFolderError
 from tensegrity_gym.task import reach
-from training import demo, report
+from training import algorithms, demo, report
 from training.demo import DemoConfig
 from training.hops import Hops
 from training.inverse import InverseConfig
@@ -124,6 +124,14 @@ def test_another_scoring_scores_anew_and_keeps_the_rest(folder: Path, tmp_path: 
     again = demo.run(replace(SMALL, out=tmp_path / "demo"))
     assert set(again.results) - set(again.skipped) == {"evaluation", "report"}
     assert np.shape(again.results["evaluation"]["policy"]["16"]["landings"]) == (4, 2, 2)
+
+
+def test_other_hyperparameters_train_another_policy(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(folder, tmp_path / "demo")
+    values = algorithms.hyperparameters("sac") | {"warmup": 0.5}
+    monkeypatch.setattr("training.train_policy.hyperparameters", lambda *_: values)
+    again = demo.run(replace(SMALL, out=tmp_path / "demo"))
+    assert set(again.results) - set(again.skipped) == {"policy", "evaluation", "report"}
 
 
 def test_another_seed_in_the_same_folder_is_refused(folder: Path) -> None:

@@ -329,13 +329,16 @@ def test_what_is_left_out_without_cma_is_said(tmp_path: Path, folder: Path, monk
     shutil.copytree(folder, tmp_path / "quick")
     monkeypatch.setattr(run, "find_spec", lambda name: None)
     config = replace(
-        CompareConfig(out=tmp_path, quick=True, progress=False).shortened(), budgets=(32,), seeds=(1,), algorithms=(), latencies=0
+        CompareConfig(out=tmp_path, quick=True, progress=False).shortened(), budgets=(32,), seeds=(1,), policy_budgets=()
     )
     comparison, said = run.Comparison(config), []
     comparison.stages.say = said.append
     comparison.run()
     assert "pip install 'tensegrity-gym[cma]'" in said[0]
     assert not {"oracle", "score_cma_0_32", "score_oracle_0_32"} & set(comparison.stages.results)
+    # times of other planners are not kept for these; nor are there policies where they have no budget
+    assert "latency" not in comparison.stages.skipped
+    assert not {"cma", "sac"} & set(comparison.stages.results["latency"])
 
 
 def test_every_method_is_timed_on_one_thread_and_often_enough(tmp_path: Path) -> None:

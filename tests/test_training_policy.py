@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from surrogate.storage import read_sealed, write_sealed
-from tensegrity_gym import Scene
+from tensegrity_gym import Scene, simulate
 from tensegrity_gym.errors import DataFileError, InvalidParameterError, OutputFolderError
 from tensegrity_gym.scene_ranges import scene_ranges
 from tensegrity_gym.task import reach
@@ -333,6 +333,25 @@ class Doubled(FlattenExtractor):
 
 #: Always copied: stable-baselines3 writes into the mapping it is given.
 RELU = {"net_arch": [8, 8], "activation_fn": torch.nn.ReLU}
+
+
+def test_threads_of_the_simulator_are_those_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def spied(*stretches: Any, threads: int | None, **options: Any) -> Any:
+        asked.append(threads)
+        return simulate(*stretches, threads=threads, **options)
+
+    monkeypatch.setattr("training.sb3_vec_env.simulate", spied)
+    train_policy(QUICK, PolicyConfig(calls=8, updates=1, envs=4), progress=False, threads=1)
+    assert asked == [1, 1]
+
+
+@pytest.mark.parametrize("values", [{"updates": 0}, {"envs": -3}, {"calls": 0}, {"checkpoint_every": 0}, {"evaluate_every": -1}])
+def test_numbers_that_mean_nothing_are_refused(values: dict[str, int]) -> None:
+    (name,) = values
+    with pytest.raises(InvalidParameterError, match=rf"^{name}: expected an integer >= \d, got {values[name]}"):
+        PolicyConfig(**values)
 
 
 @pytest.mark.parametrize(

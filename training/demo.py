@@ -23,7 +23,7 @@ from tensegrity_gym.specimen import POSITION
 from tensegrity_gym.task import reach
 from training import figures, report
 from training.hops import SEED, Hops
-from training.inverse import InverseConfig, InversePlanner
+from training.inverse import START_SEED, InverseConfig, InversePlanner
 from training.planner import NearestHopPlanner, Planner
 from training.policies import ActorPolicy
 from training.refine import RefiningPlanner
@@ -169,7 +169,7 @@ def _plans(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, held
                 correction=correction,
                 stored=known["stretches"],
                 images=net.landing_images,
-                seed=config.seed,
+                seed=config.seed + START_SEED,
             )
             planners: dict[str, Planner] = {
                 "nearest": NearestHopPlanner(known["stretches"], known["landing"], images=net.landing_images),
@@ -183,12 +183,15 @@ def _plans(stages: Stages, config: DemoConfig, scene: Scene, data: HopData, held
                 plans[method][str(budget)] = {"stretches": stretches.tolist(), "seconds": time.perf_counter() - started}
         return plans
 
-    settings = {"planner": asdict(config.planner), "turns": TURNS, "seed": config.seed, "scene": asdict(scene), "images": True}
+    settings = {"planner": asdict(config.planner), "turns": TURNS, "scene": asdict(scene), "images": True}
+    settings |= {"seed": config.seed + START_SEED}
     stages.run("plans", settings, work, needs=[f"surrogate_{b}" for b in budgets])
 
 
 def _policy(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData, budgets: list[int]) -> None:
-    from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
+    # stable-baselines3 takes seconds to import
+    from training.algorithms import LEAST_UPDATES
+    from training.train_policy import PolicyConfig, check_calls, train_policy
 
     settings = PolicyConfig(calls=config.hops, seed=config.seed, updates=config.gradient_steps)
     # its hops come some at a time, and it spends an eighth of them before it begins to learn
@@ -207,7 +210,9 @@ def _policy(stages: Stages, config: DemoConfig, scene: Scene, held_out: HopData,
             answers[str(budget)] = {"stretches": stretches.tolist(), "seconds": time.perf_counter() - started}
         return {"answers": answers, "simulator_calls": card["simulator_calls"], "seconds": card["seconds"]}
 
-    config_of_stage = {"policy": asdict(settings), "scene": asdict(scene), "budgets": budgets}
+    # of the hyper-parameters what stands in their file counts
+    how = {"values": check_calls(settings), "least_updates": LEAST_UPDATES}
+    config_of_stage = {"policy": asdict(settings), "scene": asdict(scene), "budgets": budgets} | how
     stages.run("policy", config_of_stage, work, needs=["targets"], files=[path.name, beside(path, CARD).name])
     ActorPolicy.load(path)  # a damaged or foreign checkpoint is found now, by name
 

@@ -58,8 +58,16 @@ class PolicyConfig:
     checkpoint_every: int = 512
     """Hops between two checkpoints, where there is a file to keep them in."""
     evaluate_every: int = 0
-    """Hops between two evaluations on 32 episodes of their own, which count as no training hops; 0: none. Their mean rewards
-    (minus the error over the reach) go to the progress bar, TensorBoard and the card (there since training was last resumed)."""
+    """Hops between two evaluations on 32 episodes of their own, which count as no training hops; 0: none. Rounded down to whole
+    steps of all envs, one at least. Their mean rewards (minus the error over the reach) go to the progress bar, TensorBoard and
+    the card (there since training was last resumed)."""
+
+    def __post_init__(self) -> None:
+        least = {"calls": 1, "updates": 1, "envs": 1, "checkpoint_every": 1, "evaluate_every": 0}
+        for name, bound in least.items():
+            value = getattr(self, name)
+            if value is not None and value < bound:
+                raise InvalidParameterError(f"{name}: expected an integer >= {bound}, got {value}")
 
     @property
     def together(self) -> int:
@@ -177,16 +185,16 @@ def train_policy(
     progress: bool = True,
     state: Path | None = None,
     tensorboard: Path | None = None,
+    threads: int | None = None,
 ) -> tuple[dict[int, ActorPolicy], dict[str, Any]]:
     """Train for ``config.calls`` hops; returns actors as they were after each of ``budgets`` hops, and a card.
 
     The last actor, after all the hops, is always among them. ``state`` is a file from which a killed training goes on,
-    with the same bits; it stays there for the caller to remove when the actors are safely written.
+    with the same bits; it stays there for the caller to remove when the actors are safely written. ``threads`` of the
+    simulator, None for all cores that this process may use, change no bit.
     """
-    if config.calls < 1 or any(not 0 < b <= config.calls for b in budgets):
-        raise InvalidParameterError(
-            f"calls and budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}"
-        )
+    if any(not 0 < b <= config.calls for b in budgets):
+        raise InvalidParameterError(f"budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}")
     scenes = scene if isinstance(scene, SceneRanges) else SceneRanges(scene)
     scaling, envs = Scaling.of(scenes), config.together
     symmetry = Symmetry.of(scenes) if config.symmetric else None
@@ -199,7 +207,7 @@ def train_policy(
         decisive["updates_per_hop"] = updates_per_hop(values, config.calls)
     settings = hash_of(decisive)
     with contextlib.ExitStack() as stack:
-        hops = BatchedHopVecEnv(scenes, scaling, envs, check_fidelity(config.fidelity), symmetry)
+        hops = BatchedHopVecEnv(scenes, scaling, envs, check_fidelity(config.fidelity) | {"threads": threads}, symmetry)
         clock = _Clock(hops)
         venv = stack.enter_context(contextlib.closing(VecMonitor(hops)))
         bar = stack.enter_context(

@@ -42,7 +42,7 @@ class CompareConfig:
     symmetric: tuple[str, ...] = ()
     """Policies to train that know the symmetries of lattice and ground, as planners do (see training/symmetry.py)."""
     policy_budgets: tuple[int, ...] | None = None
-    """Budgets of the policies; None: the same."""
+    """Budgets of the policies; None: the same, none at all: no policies."""
     policy_seeds: tuple[int, ...] | None = None
     """Training seeds of the policies: one number, or one for each of their budgets; None: the same."""
     hyperparameters: Path | None = None
@@ -70,7 +70,7 @@ class CompareConfig:
     oracle: int = 160
     """Hops per target of CMA-ES on the simulator; 0: no oracle."""
     updates: int = 3000
-    """Gradient steps of the surrogate, at most."""
+    """Gradient steps of the surrogate, at most, though never less than one pass over its hops."""
     surrogate: TrainConfig = field(
         default_factory=lambda: TrainConfig(net=NetConfig(hidden=(64, 64, 64)), test=0.0, device="cpu")
     )

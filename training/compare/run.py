@@ -291,7 +291,9 @@ class Comparison:
 
         def work() -> Results:
             state = beside(path, POLICY_STATE)
-            actors, card = train_policy(self.scenes, settings, progress=self.config.progress, state=state)
+            actors, card = train_policy(
+                self.scenes, settings, progress=self.config.progress, state=state, threads=self.config.threads
+            )
             actors[budget].save(path, card)
             state.unlink(missing_ok=True)
             return {
@@ -324,7 +326,8 @@ class Comparison:
 
     def _latency(self) -> None:
         budget = max(self.config.budgets)
-        policies = {m: f"policy_{m}_0_{max(self.config.budgets_of_policies)}" for m in self.config.policies}
+        largest = max(self.config.budgets_of_policies, default=None)
+        policies = {m: f"policy_{m}_0_{largest}" for m in self.config.policies if largest}
 
         def work() -> Results:
             fitted = self.fitted(0, budget)
@@ -336,7 +339,8 @@ class Comparison:
 
         needs = [f"net_0_{budget}", *policies.values()]
         content = {"questions": self.config.latencies, "tries": self.config.tries, "refine": self.config.refine} | self._planning
-        how = {"threads": 1}  # of torch; times from before, with all, are measured again
+        # threads: of torch; times from before, with all, are measured again
+        how = {"threads": 1, "planners": self.names, "targets": self.places["inside"].tolist()}
         self.stages.run("latency", content | how, work, needs=needs)
         if self.config.bayes and self.config.bayes_seeds != 0:  # apart, so that the others' times stay as they were
             name, tries = f"bayes{self.config.bayes}", self.config.bayes
