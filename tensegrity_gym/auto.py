@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
-import numpy as np
-
 from tensegrity_gym.calibration import LADDER, Calibration, calibrate, sample_stretches, stored_calibration
 from tensegrity_gym.design import Design
-from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.fidelity import FIDELITIES, Fidelity
 from tensegrity_gym.formfinding import form_find
+from tensegrity_gym.hops import positive
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
 
@@ -28,12 +26,12 @@ def choose_fidelity(design: Design, scene: Scene, lattice: Lattice, tolerance: f
 
     Raises InvalidParameterError for a tolerance that is no finite number > 0.
     """
-    if tolerance is not None and (isinstance(tolerance, bool) or not np.isfinite(tolerance) or tolerance <= 0):
-        raise InvalidParameterError(f"simulate: expected tolerance to be a finite number > 0 [m], got {tolerance!r}")
+    if tolerance is not None:
+        tolerance = positive("tolerance", tolerance)
     name = preset_of(scene) if design == Design() and lattice == Lattice() else None
     stored = stored_calibration(name, scene.landing) if name else None
     calibration = stored or pilot(design, scene, lattice)
-    asked = calibration.floor if tolerance is None else float(tolerance)
+    asked = calibration.floor if tolerance is None else tolerance
     named = "the floor of" if tolerance is None else "a tolerance of"
     known = f"{calibration.samples} hops {'stored for ' + str(name) if stored else 'tried here'}"
     for rung in calibration.rungs:

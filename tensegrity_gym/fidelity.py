@@ -101,12 +101,15 @@ FIDELITIES = {
 NAMES = ("auto", *FIDELITIES)
 
 
-def named_fidelity(fidelity: Fidelity | str) -> Fidelity:
-    """A fidelity given by value or by one of the names in ``FIDELITIES``; InvalidParameterError for anything else."""
+def named_fidelity(fidelity: Fidelity | str, names: tuple[str, ...] = NAMES) -> Fidelity:
+    """A fidelity given by value or by one of the names in ``FIDELITIES``; InvalidParameterError for anything else.
+
+    ``names`` are those that the caller takes, as the error lists them.
+    """
     if isinstance(fidelity, Fidelity):
         return fidelity
     if not isinstance(fidelity, str) or fidelity not in FIDELITIES:
-        raise InvalidParameterError(f"fidelity: expected a Fidelity or one of {NAMES}, got {fidelity!r}")
+        raise InvalidParameterError(f"fidelity: expected a Fidelity or one of {names}, got {fidelity!r}")
     return FIDELITIES[fidelity]
 
 

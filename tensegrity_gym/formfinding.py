@@ -23,7 +23,7 @@ from tensegrity_gym.searches import (
     imperfection_forces,
     start_positions,
 )
-from tensegrity_gym.types import Floats, Structure
+from tensegrity_gym.types import Floats, Structure, is_number
 
 __all__ = [
     "METHODS",
@@ -174,7 +174,7 @@ def _as_options(options: SearchOptions | None) -> SearchOptions:
     options = options or SearchOptions()
     for name in ("tolerance", "max_iterations", "load_step", "line_tolerance", "line_cap"):
         value = getattr(options, name)
-        if value is not None and not (np.isfinite(value) and value > 0):
+        if value is not None and not (is_number(value) and value > 0):
             raise InvalidParameterError(f"SearchOptions.{name}: expected a finite number > 0, got {value!r}")
     if options.damping not in DAMPINGS:
         raise InvalidParameterError(f"SearchOptions.damping: expected one of {DAMPINGS}, got {options.damping!r}")

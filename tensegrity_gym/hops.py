@@ -17,7 +17,7 @@ from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.rollouts import Problem, follow
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.timestep import MARGIN, default_time_step
-from tensegrity_gym.types import Floats, HopStatus, Structure
+from tensegrity_gym.types import Floats, HopStatus, Structure, is_number
 from tensegrity_gym.version import MODEL_VERSION
 
 #: The critical step in the stiffest posture of a hop or drop over that of the unloaded lattice (docs/accuracy.md).
@@ -196,6 +196,6 @@ def time_step(dt: float | None, design: Design, lattice: Lattice, fidelity: Fide
 
 def positive(name: str, value: float) -> float:
     """``value`` as a float; InvalidParameterError if it is no finite number > 0."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not np.isfinite(value) or value <= 0:
+    if not is_number(value) or value <= 0:
         raise InvalidParameterError(f"simulate: expected {name} to be a finite number > 0, got {value!r}")
     return float(value)

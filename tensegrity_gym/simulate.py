@@ -10,11 +10,12 @@ from tensegrity_gym.batch import Progress
 from tensegrity_gym.core import records as rec
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError
-from tensegrity_gym.fidelity import Fidelity, changed, named_fidelity
+from tensegrity_gym.fidelity import FIDELITIES, Fidelity, changed, named_fidelity
 from tensegrity_gym.formfinding import Equilibria, form_find
 from tensegrity_gym.hops import HopResult, hop, positive, run, time_step
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
+from tensegrity_gym.types import Floats, is_number
 
 
 def simulate(
@@ -113,19 +114,20 @@ def drop(
         attitude: unit quaternion (w, x, y, z) from the design's frame to the ground's, shape (4,) or (n, 4).
         spin: angular velocity [rad/s], shape (3,) or (n, 3).
 
-    The rest is as for :func:`simulate`; the result's take-off is the moment of release, its stretches are 1.
+    The rest is as for :func:`simulate`, but for fidelity "auto", which only hops have; the result's take-off is the moment of
+    release, its stretches are 1.
 
     Raises InvalidParameterError.
     """
     design, scene, lattice = design or Design(), Scene.of(scene, "drop"), lattice or Lattice()
-    chosen = named_fidelity(fidelity)
+    chosen = named_fidelity(fidelity, tuple(FIDELITIES))  # "auto" knows the errors of hops, not those of drops
     modelled = chosen.design(design)
-    rows = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in (velocity, attitude, spin)]
+    rows = [_as_rows(name, a) for name, a in (("velocity", velocity), ("attitude", attitude), ("spin", spin))]
     n = max(len(row) for row in rows)
     for name, row, width in zip(("velocity", "attitude", "spin"), rows, (3, 4, 3), strict=True):
         if row.ndim != 2 or row.shape[1] != width or len(row) not in (1, n) or not np.isfinite(row).all():
             raise InvalidParameterError(f"drop: expected {name} finite, of shape ({width},) or ({n}, {width}), got {row!r}")
-    if not np.isfinite(height) or height < 0:
+    if not is_number(height) or height < 0:
         raise InvalidParameterError(f"drop: expected height to be a finite number >= 0 [m], got {height!r}")
     wide = [np.broadcast_to(row, (n, row.shape[1])) for row in rows]
     starts = _falling(modelled, lattice, wide[0], wide[1], wide[2], height)
@@ -144,6 +146,13 @@ def drop(
         rate=rate,
         threads=threads,
     )
+
+
+def _as_rows(name: str, values: ArrayLike) -> Floats:
+    try:
+        return np.atleast_2d(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise InvalidParameterError(f"drop: expected {name} as an array of finite numbers, got {values!r}") from None
 
 
 def _falling(

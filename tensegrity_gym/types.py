@@ -16,6 +16,13 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
+def is_number(value: object) -> bool:
+    """Whether ``value`` is one finite real number: no bool, no text, no array."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        return False
+    return bool(np.isfinite(value))
+
+
 class Structure(NamedTuple):
     """Point masses and the members between them: all that statics and dynamics need to know of a lattice.
 

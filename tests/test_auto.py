@@ -49,7 +49,7 @@ def test_the_cheapest_model_within_the_tolerance_is_taken(
     assert ("nothing cheaper is known" in chosen.reason) == (expected is None)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, -1.0, np.nan, np.inf, True])
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, np.nan, np.inf, True, "x", np.array([1e-3, 1e-2])])
 def test_a_tolerance_that_is_none_is_refused(stored: None, tolerance: float) -> None:
     with pytest.raises(InvalidParameterError, match="expected tolerance to be a finite number > 0"):
         choose_fidelity(Design(), TOUCHDOWN, Lattice(), tolerance)

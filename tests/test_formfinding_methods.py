@@ -373,6 +373,9 @@ def test_bad_options_are_refused() -> None:
         form_find(STRETCHES, lattice=CELL, method="relaxation", options=SearchOptions(damping="air"))
     with pytest.raises(InvalidParameterError, match="tolerance"):
         form_find(STRETCHES, lattice=CELL, options=SearchOptions(tolerance=-1.0))
+    for name in ("tolerance", "max_iterations", "load_step", "line_tolerance", "line_cap"):
+        with pytest.raises(InvalidParameterError, match=rf"SearchOptions\.{name}: expected a finite number > 0, got 'x'"):
+            form_find(STRETCHES, lattice=CELL, options=SearchOptions(**{name: "x"}))  # type: ignore[arg-type]
     with pytest.raises(InvalidParameterError, match="expected start"):
         form_find(STRETCHES, lattice=CELL, start=np.zeros((2, 3, 3)))
 
