@@ -17,6 +17,9 @@ from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.types import Floats, is_number
 
+#: Height over the ground that a drop's masses start from at least: as good as none, and more than zero in float32 too [m].
+LEAST_HEIGHT = 1e-30
+
 
 def simulate(
     stretches: ArrayLike,
@@ -171,4 +174,7 @@ def _falling(
     arms = shape + 2 * w[:, None] * turn + 2 * np.cross(axis[:, None], turn)
     lift = np.zeros((len(arms), 1, 3))
     lift[:, 0, 2] = height - arms[:, :, 2].min(axis=1)
-    return np.stack([arms + lift, velocity[:, None] + np.cross(spin[:, None], arms)], axis=1)
+    positions = arms + lift
+    # a mass at the very height of the ground would be stopped before it came down, and its touchdown be missed
+    positions[:, :, 2] = np.maximum(positions[:, :, 2], LEAST_HEIGHT)
+    return np.stack([positions, velocity[:, None] + np.cross(spin[:, None], arms)], axis=1)
