@@ -35,7 +35,9 @@ def measure(records: rec.HopRecords, problem: Problem, lattice: Lattice) -> dict
     gravity = problem.ground.gravity
     # from the saved state back to the instant of take-off: the centre of mass falls freely
     velocity = np.where(took_off[:, None], centre[:, takeoff, 1] + records.shift[:, :1] * gravity, 0.0)
-    ballistic = centre[:, takeoff, 0, 2] + centre[:, takeoff, 1, 2] ** 2 / (-2 * gravity[2])
+    # a drop may begin on its way down: it has been highest at its start
+    rising = np.maximum(centre[:, takeoff, 1, 2], 0.0)
+    ballistic = centre[:, takeoff, 0, 2] + rising**2 / (-2 * gravity[2])
     top = np.where(took_off, ballistic, np.maximum(records.height, centre[:, start, 0, 2]))
     return {
         "rest": at_rest(centre),
@@ -43,7 +45,7 @@ def measure(records: rec.HopRecords, problem: Problem, lattice: Lattice) -> dict
         "rest_nodes": at_rest(nodes),
         "touchdown_nodes": at_touchdown(nodes),
         "apex": top - centre[:, start, 0, 2],
-        "apex_time": np.where(took_off, takeoff_time - velocity[:, 2] / gravity[2], np.nan),
+        "apex_time": np.where(took_off, takeoff_time - np.maximum(velocity[:, 2], 0.0) / gravity[2], np.nan),
         "takeoff_time": takeoff_time,
         "takeoff_velocity": velocity,
         "touchdown_time": touchdown_time,

@@ -198,6 +198,18 @@ def test_what_follows_a_drop_from_the_very_ground_is_what_follows_one_from_near_
     assert np.abs(ground.energies.sum(axis=2) - ground.energies[:, :1].sum(axis=2)).max() < 1e-2
 
 
+@pytest.mark.parametrize("fidelity", ["paper", "flown"])
+def test_a_drop_is_highest_where_it_stops_rising_or_at_its_start(fidelity: str) -> None:
+    """v^2/2g above the start and v/g after the release where it is thrown upwards; where it only falls, its start."""
+    speed = np.array([2.0, 0.0, -5.0])
+    scene = Scene(duration=0.25, landing="touchdown")
+    r = drop(np.outer(speed, [0, 0, 1]), height=0.5, scene=scene, lattice=Lattice(1, 1), fidelity=fidelity, threads=1)
+    rising = np.maximum(speed, 0.0)
+    np.testing.assert_allclose(r.apex, rising**2 / (2 * 9.80665), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(r.apex_time, rising / 9.80665, rtol=0, atol=1e-6)
+    assert (r.apex_time <= r.touchdown_time).all()
+
+
 def test_a_turned_drop_falls_turned() -> None:
     """Attitude and spin as Rodrigues' matrix has them; a lattice that spins at 2 rad/s bulges by less than 0.1 mm."""
     axis, rate = np.array([1.0, 2.0, -0.5]), 2.0
