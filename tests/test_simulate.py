@@ -6,9 +6,11 @@ magnitude (docs/physics.md), so only touchdown is compared where round-off enter
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import kernels
@@ -19,6 +21,7 @@ from tensegrity_gym import (
     ENERGY_NAMES,
     Design,
     Equilibria,
+    Fidelity,
     HopResult,
     HopStatus,
     InvalidParameterError,
@@ -310,6 +313,26 @@ def test_a_step_far_above_the_critical_one_is_unstable_and_says_so() -> None:
     assert r.landing.tolist() == [[0.0, 0.0], [0.0, 0.0]]
     for field in ("rest", "touchdown", "apex", "takeoff_velocity", "energies", "end_time"):
         assert np.isfinite(getattr(r, field)).all(), field
+
+
+def test_a_hop_that_hardly_takes_off_jumps() -> None:
+    """The command in docs/physics.md: a thousandth less in one stretch, and a foot touches again while the body still rises.
+
+    Both leave the ground at the same time and speed; the one falls back at once, the other tumbles on and lands far off.
+    """
+    page = (Path(__file__).parent.parent / "docs" / "physics.md").read_text(encoding="utf-8")
+    command = re.search(r"tensegrity_gym hop --stretches ([\d. ]+)`", page)
+    assert command
+    one = np.array(command[1].split(), dtype=float)
+    scene, followed = Scene.preset("earth", landing="touchdown"), Fidelity(stop="landing")
+    r = simulate([one, one - [0.001, 0, 0, 0]], scene=scene, fidelity=followed, threads=1)
+    np.testing.assert_allclose(r.takeoff_time, 0.42, rtol=0, atol=0.01)
+    assert (r.takeoff_velocity[:, 2] < 0.3).all()  # which ballistic flight would outlast by 0.06 s
+    assert r.flight_time[0] < 0.05
+    assert r.flight_time[1] > 0.5
+    near, far = np.linalg.norm(r.touchdown, axis=1)
+    assert near < 0.1
+    assert far > near + 0.3
 
 
 @pytest.mark.parametrize("landing", ["rest", "touchdown"])
