@@ -140,8 +140,9 @@ def calibrate(
 
     for model in {model for models in ladder.values() for model in models}:  # compiles and loads, before time is taken
         short = replace(scene, duration=0.1)  # with a take-off
-        first = form_find(stretches[:1], design=model.design(design), scene=short, lattice=lattice, threads=1)
-        hop(first, design=design, scene=short, lattice=lattice, fidelity=replace(model, clearance=0.0), threads=1)
+        # as many hops over as many threads as are timed: one hop alone runs kernels of its own, without lanes
+        first = form_find(stretches, design=model.design(design), scene=short, lattice=lattice, threads=threads)
+        hop(first, design=design, scene=short, lattice=lattice, fidelity=replace(model, clearance=0.0), threads=threads)
     plain = Fidelity(stop="landing")
     exact = run(replace(reference, stop="landing"), last)[0]
     paper, paper_seconds = run(plain, last)

@@ -122,6 +122,33 @@ def test_calibration_measures_what_a_model_costs_and_how_far_off_it_is() -> None
     assert {r.fidelity: r.error for r in first.rungs} == {r.fidelity: r.error for r in again.rungs}
 
 
+def test_time_is_taken_of_kernels_that_have_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lone hop runs kernels of its own, without lanes: warmed up are as many hops, on as many threads, as are timed."""
+    asked: dict[str, list[tuple]] = {"form_find": [], "hop": []}
+    form, follow = calibration.form_find, calibration.hop
+
+    def noted_form_find(stretches, **how):
+        asked["form_find"].append((how["design"], len(stretches), how["threads"]))
+        return form(stretches, **how)
+
+    def noted_hop(found, **how):
+        kernel = replace(how["fidelity"], clearance=0.0)
+        asked["hop"].append((how["scene"].duration, kernel, len(found.stretches), how["threads"]))
+        return follow(found, **how)
+
+    monkeypatch.setattr(calibration, "form_find", noted_form_find)
+    monkeypatch.setattr(calibration, "hop", noted_hop)
+    single = Fidelity(precision="float32", stop="landing")
+    models = (single, replace(single, flight="rigid"), Fidelity(stop="landing"))
+    calibrate(Scene(duration=0.5), 5, lattice=Lattice(1, 1), ladder={"touchdown": models}, unknowns=1, threads=2)
+    kernels = {(replace(model, clearance=0.0), 5, 2) for model in models}
+    warm, timed = asked["hop"][:3], asked["hop"][-3:]
+    assert {one[0] for one in warm} == {0.1}
+    assert {one[0] for one in timed} == {0.5}
+    assert {one[1:] for one in warm} == {one[1:] for one in timed} == kernels
+    assert set(asked["form_find"][:3]) == set(asked["form_find"][-3:])
+
+
 def test_a_calibration_on_no_hops_is_refused() -> None:
     with pytest.raises(InvalidParameterError, match=r"expected an integer >= 1 of hops .* got 0"):
         calibrate(Scene(), 0)
