@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tensegrity_gym import task
+from tensegrity_gym.auto import choose_fidelity
 from tensegrity_gym.design import Design
 from tensegrity_gym.env import plain_seed, show
 from tensegrity_gym.errors import InvalidParameterError, ResetNeededError
@@ -88,7 +89,7 @@ class TensegrityTravelEnv(gym.Env[np.ndarray, np.ndarray]):
         success_radius: being within this of the goal is arrival [reaches].
         success_bonus: added on arrival [-].
         hop_cost: taken off for every hop [-].
-        fidelity: as ``TensegrityHop-v0``.
+        fidelity: as ``TensegrityHop-v0``; "auto" is chosen once an episode, at its first hop.
         render_mode: as ``TensegrityHop-v0``.
     """
 
@@ -124,6 +125,7 @@ class TensegrityTravelEnv(gym.Env[np.ndarray, np.ndarray]):
         self._viewer = Viewer(render_mode, self.lattice)
         self._running = False
         self._hops = 0
+        self._levers = self.levers
         self.scene = self.scenes.base
         self.heading = 0.0
         self.position: Floats = np.zeros(2)
@@ -147,6 +149,7 @@ class TensegrityTravelEnv(gym.Env[np.ndarray, np.ndarray]):
             assert isinstance(box, spaces.Box)
             goal = _check_goal(options["goal"], float(box.high[0]))
         self.goal, self.position, self.heading = goal, np.zeros(2), 0.0
+        self._levers = self.levers
         self._hops, self._running = 0, True
         self._viewer.wait(self.goal)
         return self._observe(), {**self._whereabouts(), "reach": reach}
@@ -157,9 +160,13 @@ class TensegrityTravelEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ResetNeededError("step: expected a running episode, got none; call reset() first")
         stretches = task.check_action(action, self.action_space.shape or ())
         start, before = (float(self.position[0]), float(self.position[1]), self.heading), self._distance()
-        downhill = _wrapped(self.scene.slope_direction - self.heading)
+        # flat ground has no downhill: turning it would only make it look like another scene
+        downhill = _wrapped(self.scene.slope_direction - self.heading) if self.scene.slope > 0 else 0.0
         scene = replace(self.scene, slope_direction=downhill, duration=PATIENCE * self.scene.duration)
-        hop = simulate(stretches, scene=scene, lattice=self.lattice, trajectory_rate=self._viewer.rate, **self.levers)
+        if self._levers["fidelity"] == "auto":
+            # for the scene as it was drawn: each hop's own slopes another way, and would be tried out anew
+            self._levers = {**self._levers, "fidelity": choose_fidelity(Design(), self.scene, self.lattice)}
+        hop = simulate(stretches, scene=scene, lattice=self.lattice, trajectory_rate=self._viewer.rate, **self._levers)
         self.simulator_calls += 1
         self._hops += 1
         failed = bool(task.failed(hop.status)[0])

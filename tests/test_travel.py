@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import tensegrity_gym  # noqa: F401 (registers the env)
-from tensegrity_gym import Design, HopStatus, Lattice, Scene, simulate, task, travel
+from tensegrity_gym import Design, Fidelity, HopStatus, Lattice, Scene, auto, simulate, task, travel
+from tensegrity_gym.calibration import Calibration, Rung
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError, ResetNeededError
 from tensegrity_gym.travel import FLIP, PATIENCE, TensegrityTravelEnv, read_pose, turned
 
@@ -163,6 +165,56 @@ def test_every_option_does_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None
         assert arrived == (after["distance"] <= 2.999 * info["reach"])
         assert reward == pytest.approx(nearer - 0.7 + 4.0 * arrived, rel=1e-12)
     assert {one["fidelity"] for one in asked} == {"single"}
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Scene]]:
+    """The scenes that models were tried out in, by a stand-in for the calibration that finds one known by heart."""
+    scenes: list[Scene] = []
+
+    def calibrate(scene: Scene, *_: Any, **__: Any) -> dict[str, Calibration]:
+        scenes.append(scene)
+        return {scene.landing: Calibration(2e-3, (Rung(Fidelity(precision="float32"), 0.3, 3e-4, 1.5e-3),), 16)}
+
+    monkeypatch.setattr(auto, "calibrate", calibrate)
+    auto.pilot.cache_clear()
+    yield scenes
+    auto.pilot.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("scene", "pilots"),
+    [
+        (SHORT, 1),
+        (replace(SHORT, slope=0.1, slope_direction=0.4), 1),
+        ("earth", 0),
+        ("slope", 0),
+        ({"gravity": (6.0, 9.8), "duration": 0.15}, 2),
+    ],
+    ids=["flat", "sloping", "preset", "sloping preset", "ranges"],
+)
+def test_auto_is_chosen_once_an_episode_for_the_scene_as_drawn(
+    scene: Any, pilots: int, tried: list[Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each hop is simulated on ground turned into the lattice's frame, and for longer: not in scenes of their own."""
+    asked: list[dict[str, Any]] = []
+    hop = simulate(UNEVEN.astype(float), scene=SHORT)
+
+    def noted(*_: Any, **named: Any) -> Any:
+        asked.append(named)
+        return hop
+
+    monkeypatch.setattr(travel, "simulate", noted)
+    env = TensegrityTravelEnv(scene=scene, fidelity="auto")
+    for _ in range(2):
+        env.reset(seed=3 if pilots < 2 else None)
+        for _ in range(3):
+            env.step(UNEVEN)
+        expected = auto.choose_fidelity(Design(), env.scene, LATTICE)
+        assert {str(one["fidelity"]) for one in asked[-3:]} == {str(expected)}
+    assert len(tried) == pilots
+    headings = {one["scene"].slope_direction for one in asked[:3]}
+    assert headings == {0.0} if env.scene.slope == 0 else len(headings) == 3
 
 
 def test_a_failed_hop_gets_the_worst_reward_and_ends_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
