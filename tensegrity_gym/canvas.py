@@ -164,8 +164,7 @@ def member_loads(positions: Floats, structure: Structure, actuator_length: Float
     """
     forces = member_forces(structure, positions[None], np.asarray(actuator_length, dtype=float)[None])
     segments = structure.bars.shape[1] - 1
-    hinges = np.maximum(segments, 2)
-    critical = structure.hinge_stiffness * (2 * np.sin(np.pi / (2 * hinges))) ** 2 / structure.segment_length
+    critical = structure.hinge_stiffness * (2 * np.sin(np.pi / (2 * segments))) ** 2 / structure.segment_length
     critical = np.where(critical > 0, critical, 1.0)
     typical = float(critical.mean())
     return forces.bars[0] / critical, forces.cables[0] / typical, forces.actuators[0] / typical

@@ -79,6 +79,18 @@ def test_loads_are_those_of_form_finding_over_the_critical_load() -> None:
     np.testing.assert_allclose(actuators, found.actuator_tension[0] / DESIGN.critical_load, rtol=1e-4)
 
 
+@pytest.mark.parametrize("segments", [1, 2, 3, 4])
+def test_the_load_of_a_bar_is_the_same_however_finely_it_is_divided(segments: int) -> None:
+    """The prestress load over Euler's, to the strain by which a bar's natural length is longer: 2e-5."""
+    design = Design(bar_segments=segments)
+    structure = design.structure(LATTICE)
+    bars, cables, _ = member_loads(design.unloaded_positions(LATTICE), structure, structure.actuator_length)
+    np.testing.assert_allclose(bars, DESIGN.prestress_load / DESIGN.critical_load, rtol=1e-4)
+    between = ~LATTICE.edge_is_square  # which no two cells share
+    tension = DESIGN.cable_rigidity * DESIGN.prestrain
+    np.testing.assert_allclose(cables[: len(between)][between], tension / DESIGN.critical_load, rtol=1e-4)
+
+
 def test_bars_are_coloured_by_load_and_cables_by_tension(standing: np.ndarray) -> None:
     colours = np.array(BAR_COLOURS, dtype=float)
     for shrink, expected in ((1.0, None), (0.99, colours[-1]), (1.01, colours[0])):
