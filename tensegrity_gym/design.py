@@ -139,6 +139,12 @@ class Design:
             raise InvalidParameterError(
                 f"Design.bar_segments: expected an integer from 1 to {MAX_SEGMENTS}, got {self.bar_segments!r}"
             )
+        if not self.prestress_load < self.bar_rigidity:
+            raise InvalidParameterError(
+                "Design: expected an axial rigidity EA of the bars above their prestress load, got "
+                f"{self.bar_rigidity:.4g} N and {self.prestress_load:.4g} N, which would press a bar of any length to nothing; "
+                "take a larger bar_modulus or bar_diameter, or less bar_softening or prestrain"
+            )
 
     @property
     def cell_height(self) -> float:

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
-from tensegrity_gym import Design, InvalidParameterError, Lattice
+from tensegrity_gym import Design, Fidelity, InvalidParameterError, Lattice
 from tensegrity_gym.design import cell_equilibrium, cell_node_positions, equal_cable_equilibrium
 from tensegrity_gym.types import Ground, Structure
 
@@ -306,6 +306,21 @@ def test_zero_is_refused_where_it_would_divide(name: str) -> None:
 @pytest.mark.parametrize("name", NOT_NEGATIVE)
 def test_zero_is_accepted_where_it_means_none(name: str) -> None:
     assert getattr(replace(Design(), **{name: 0.0}), name) == 0.0
+
+
+def test_bars_that_their_prestress_would_press_to_nothing_are_refused() -> None:
+    """L0 (1 - P/EA) = L has a natural length L0 > 0 only for EA > P; without prestrain any bar will do."""
+    said = "expected an axial rigidity EA of the bars above their prestress load"
+    for change in ({"bar_modulus": 1e6}, {"bar_softening": 1e6}, {"prestrain": 30.0}):
+        with pytest.raises(InvalidParameterError, match=said):
+            Design(**change)
+    with pytest.raises(InvalidParameterError, match=rf"{said}, got 1\.634 N and 34\.9\d N.*less bar_softening"):
+        Fidelity(bar_softening=1e6).design(Design())
+    softest = Design().bar_rigidity / Design().prestress_load
+    with pytest.raises(InvalidParameterError, match=said):
+        Design(bar_softening=1.001 * softest)
+    assert (Design(bar_softening=0.999 * softest).structure(Lattice(1, 1)).segment_length > 0).all()
+    assert Design(bar_modulus=1e3, prestrain=0.0).prestress_load == 0.0
 
 
 @pytest.mark.parametrize("value", [0, -3, 2.5, np.nan, "three"])
