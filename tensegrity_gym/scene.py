@@ -53,6 +53,11 @@ class Scene:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not low <= value <= high:
                 raise InvalidParameterError(f"Scene.{name}: expected a number in [{low:g}, {high:g}], got {value!r}")
+        if self.slope == np.pi / 2:
+            raise InvalidParameterError(
+                f"Scene.slope: expected less than pi/2 [rad], got {self.slope!r}: along a vertical wall nothing would ever land; "
+                "take a gentler slope"
+            )
         if self.gravity == 0 or self.duration == 0:
             raise InvalidParameterError("Scene.gravity and Scene.duration: expected > 0, got 0; nothing would ever land")
         if self.landing not in LANDINGS:

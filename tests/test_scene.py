@@ -53,6 +53,7 @@ def test_flat_ground_has_vertical_gravity() -> None:
         ("gravity", float("nan")),
         ("gravity", "high"),
         ("slope", 2.0),
+        ("slope", np.pi / 2),
         ("slope", -0.1),
         ("friction", -0.5),
         ("friction", float("inf")),
