@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tempfile
 import tomllib
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 import tensegrity_gym
 from tensegrity_gym.cli import main
+from tensegrity_gym.core import jit
 
 ROOT = Path(__file__).parent.parent
 HEAVY = ("torch", "matplotlib", "stable_baselines3", "tensorboard", "PIL.Image")
@@ -63,3 +65,18 @@ def test_mistakes_are_told_in_one_line(args: list[str], said: str, capsys: pytes
     error = capsys.readouterr().err
     assert re.match(said, error)
     assert error.count("\n") == 1
+
+
+def test_kernels_are_cached_among_temporary_files_where_there_is_no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As for a user that is not in the list of users, in a container."""
+
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("TENSEGRITY_GYM_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", home)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = Path(jit._cache_folder())
+    assert folder.is_dir()
+    assert tmp_path in folder.parents

@@ -20,17 +20,17 @@ def _cache_folder() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(file.read_bytes())
-    root = (
-        os.environ.get("TENSEGRITY_GYM_CACHE")
-        or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tensegrity_gym"
-    )
-    folder = Path(root) / digest.hexdigest()[:16]
     try:
+        root = (
+            os.environ.get("TENSEGRITY_GYM_CACHE")
+            or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tensegrity_gym"
+        )
+        folder = Path(root) / digest.hexdigest()[:16]
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f".writable-{os.getpid()}"
         probe.touch()
         probe.unlink()
-    except OSError:
+    except (OSError, RuntimeError):  # nothing can be written there, or the user has no home at all
         folder = Path(tempfile.gettempdir()) / f"tensegrity_gym-{os.getuid()}" / digest.hexdigest()[:16]
         folder.mkdir(parents=True, exist_ok=True)
     return str(folder)
