@@ -79,13 +79,20 @@ class Calibration:
 
 
 def sample_stretches(n: int, seed: int, n_actuators: int = 4) -> Floats:
-    """Sobol stretches over the range, shape (n, n_actuators)."""
-    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-        raise InvalidParameterError(f"stretches: expected an integer >= 1 of hops to draw them for, got {n!r}; ask for more hops")
+    """Sobol stretches over the range, shape (n, n_actuators); ``n`` and ``seed`` as :func:`check_sample` has them."""
+    check_sample(n, seed)
     from scipy.stats import qmc  # heavy to import, and only calibration needs it
 
     low, high = STRETCH_RANGE
     return low + (high - low) * qmc.Sobol(n_actuators, seed=seed).random_base2(int(np.ceil(np.log2(n))))[:n]
+
+
+def check_sample(n: int, seed: int) -> None:
+    """InvalidParameterError for a number of hops, or a seed, that :func:`sample_stretches` cannot draw stretches for."""
+    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+        raise InvalidParameterError(f"stretches: expected an integer >= 1 of hops to draw them for, got {n!r}; ask for more hops")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InvalidParameterError(f"stretches: expected an integer seed >= 0, got {seed!r}; any such number will do")
 
 
 def perturbed(

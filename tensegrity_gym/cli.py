@@ -48,6 +48,10 @@ def hop(
         check_writable(path)
     if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp"):
         raise InvalidParameterError(f"--picture: expected a path that ends in .png, .jpg or .webp, got {str(picture)!r}")
+    if video is not None:
+        from tensegrity_gym.render import check_film
+
+        check_film(video, "--video")
     result = simulate(stretches, scene=where, fidelity=fidelity, tolerance=tolerance, trajectory_rate=240.0 if picture else None)
     print(summary(result, where))
     if picture is not None and result.trajectory is not None:
@@ -100,6 +104,7 @@ def reach(scene: str = "earth", hops: int = 256, seed: int = 0, save: bool = Fal
         seed: of the Sobol sequence.
         save: replace the reach that the package stores for this preset, which targets and rewards follow.
     """
+    calibration.check_sample(hops, seed)  # before a progress bar is drawn
     with tqdm(total=hops, desc=f"hops, {scene}", unit="hop") as bar:
         measured = reachable.measure_reach(Scene.preset(scene), hops, seed, bar.update)
     for landing, found in measured.items():
@@ -121,6 +126,7 @@ def calibrate(scene: str = "earth", samples: int = 64, seed: int = 1, save: bool
         seed: of the Sobol sequence that their stretches are from.
         save: replace the calibration that the package stores for this preset, which `fidelity="auto"` chooses by.
     """
+    calibration.check_sample(samples, seed)
     batches = 2 + calibration.UNKNOWNS + sum(len(models) for models in calibration.LADDER.values())
     with tqdm(total=batches, desc=f"models, {scene}", unit="batch") as bar:
         measured = calibration.calibrate(Scene.preset(scene), samples, seed, progress=bar.update)

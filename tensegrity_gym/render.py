@@ -168,8 +168,7 @@ def record_hop(
     relative to the start. The camera holds the whole hop in view.
     """
     path = Path(path)
-    if path.suffix.lower() not in (".gif", ".mp4"):
-        raise InvalidParameterError(f"record_hop: expected a path that ends in .gif or .mp4, got {str(path)!r}")
+    check_film(path, "record_hop")
     if not fps > 0 or not speed > 0:
         raise InvalidParameterError(f"record_hop: expected fps > 0 and speed > 0, got {fps!r} and {speed!r}")
     scene, design, lattice = scene or Scene(), design or Design(), lattice or Lattice(2, 2)
@@ -183,6 +182,20 @@ def record_hop(
     pictures = hop_frames(trajectory, lattice=lattice, design=design, size=size, target=target)
     _write_video(pictures, path, fps)
     return path
+
+
+def check_film(path: Path, caller: str) -> None:
+    """InvalidParameterError, in the name of ``caller``, for a path that is no .gif or .mp4; MissingExtraError for an .mp4
+    without the extra "video": better before a simulation than after it."""
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise InvalidParameterError(f"{caller}: expected a path that ends in .gif or .mp4, got {str(path)!r}")
+    if path.suffix.lower() == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401 (whether it is there)
+        except ImportError:
+            raise MissingExtraError(
+                f"{caller}: .mp4 needs imageio-ffmpeg: pip install 'tensegrity-gym[video]', or write a .gif"
+            ) from None
 
 
 def hop_frames(
@@ -299,12 +312,8 @@ def _write_video(pictures: list[np.ndarray], path: Path, fps: int) -> None:
         frames = [Image.fromarray(p).quantize(palette=first, dither=Image.Dither.NONE) for p in pictures]
         frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False)
         return
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise MissingExtraError(
-            "record_hop: .mp4 needs imageio-ffmpeg: pip install 'tensegrity-gym[video]', or write a .gif"
-        ) from None
+    import imageio_ffmpeg
+
     height, width = pictures[0].shape[:2]
     writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=fps, macro_block_size=2, quality=8)
     writer.send(None)

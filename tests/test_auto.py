@@ -149,6 +149,12 @@ def test_time_is_taken_of_kernels_that_have_run(monkeypatch: pytest.MonkeyPatch)
     assert set(asked["form_find"][:3]) == set(asked["form_find"][-3:])
 
 
+@pytest.mark.parametrize("seed", [-1, 0.5, "x", True, None])
+def test_a_seed_that_no_sample_has_is_refused(seed: object) -> None:
+    with pytest.raises(InvalidParameterError, match="expected an integer seed >= 0, got"):
+        calibration.sample_stretches(4, seed)  # type: ignore[arg-type]
+
+
 def test_a_calibration_on_no_hops_is_refused() -> None:
     with pytest.raises(InvalidParameterError, match=r"expected an integer >= 1 of hops .* got 0"):
         calibrate(Scene(), 0)

@@ -14,6 +14,8 @@ import pytest
 import tensegrity_gym
 from tensegrity_gym.cli import main
 from tensegrity_gym.core import jit
+from tensegrity_gym.errors import MissingExtraError
+from tensegrity_gym.render import record_hop
 
 ROOT = Path(__file__).parent.parent
 HEAVY = ("torch", "matplotlib", "stable_baselines3", "tensorboard", "PIL.Image")
@@ -58,13 +60,35 @@ def test_info_prints_the_lattice_and_the_design(capsys: pytest.CaptureFixture[st
         (["hop", "--stretches", "nan", "0.3", "0.3", "0.3"], "InvalidStretchesError: .*expected.*got"),
         (["hop", "--picture", "no/such/folder/hop.png"], "OutputFolderError: expected an existing folder"),
         (["hop", "--picture", "hop.pdf"], "InvalidParameterError: --picture: expected a path that ends in"),
+        (["hop", "--video", "hop.avi"], "InvalidParameterError: --video: expected a path that ends in .gif or .mp4"),
+        (["reach", "--seed", "-1"], "InvalidParameterError: .*expected an integer seed >= 0, got -1"),
+        (["calibrate", "--seed", "-1"], "InvalidParameterError: .*expected an integer seed >= 0, got -1"),
+        (["reach", "--hops", "0"], "InvalidParameterError: .*expected an integer >= 1 of hops .*got 0"),
     ],
 )
-def test_mistakes_are_told_in_one_line(args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_told_in_one_line(
+    args: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "--video" in args:  # known without a simulation
+        monkeypatch.delattr("tensegrity_gym.cli.simulate")
     assert main(args) == 2
     error = capsys.readouterr().err
     assert re.match(said, error)
     assert error.count("\n") == 1
+
+
+def test_a_film_that_cannot_be_written_is_known_before_the_hop(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    for module in ("cli", "render"):
+        monkeypatch.delattr(f"tensegrity_gym.{module}.simulate")
+    assert main(["hop", "--video", str(tmp_path / "hop.mp4")]) == 2
+    assert re.match(
+        r"MissingExtraError: --video: \.mp4 needs imageio-ffmpeg: pip install .* or write a \.gif", capsys.readouterr().err
+    )
+    with pytest.raises(MissingExtraError, match=r"record_hop: \.mp4 needs imageio-ffmpeg"):
+        record_hop([0.3] * 4, tmp_path / "hop.mp4")
 
 
 def test_kernels_are_cached_among_temporary_files_where_there_is_no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
