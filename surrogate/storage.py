@@ -133,6 +133,8 @@ def write_json(path: Path | str, content: Any) -> None:
 
 def read_json(path: Path | str) -> Any:
     """Read JSON; DataFileError when the file is missing or damaged."""
+    if not Path(path).exists():
+        raise DataFileError(f"expected a readable JSON file at {path}, found none; see whether the name is right")
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -165,7 +165,7 @@ def test_checkpoint_round_trip_and_refusals(tmp_path: Path) -> None:
         path.with_suffix(".json").write_text(text)
         with pytest.raises(DataFileError, match=named):
             model.load(path)
-    with pytest.raises(DataFileError, match="readable JSON"):
+    with pytest.raises(DataFileError, match="found none; see whether"):
         model.load(tmp_path / "absent.safetensors")
 
 

@@ -253,7 +253,7 @@ def test_actor_round_trip_and_refusals(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(DataFileError, match="checksum"):
         ActorPolicy.load(path)
-    with pytest.raises(DataFileError, match="readable JSON"):
+    with pytest.raises(DataFileError, match="found none; see whether"):
         ActorPolicy.load(tmp_path / "absent.safetensors")
 
 

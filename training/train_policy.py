@@ -31,6 +31,8 @@ from training.symmetry import Symmetry
 
 #: Added to the seed of the envs that a policy is evaluated in while it trains.
 EVALUATION_SEED = 2_000_003
+#: Largest seed of a policy: numpy's takes 32 bits, and envs add their number and EVALUATION_SEED to it.
+MOST_SEED = 2**31
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,8 @@ class PolicyConfig:
     the card (there since training was last resumed)."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.seed <= MOST_SEED:
+            raise InvalidParameterError(f"seed: expected an integer from 0 to 2^31, got {self.seed}; any such will do")
         least = {"calls": 1, "updates": 1, "envs": 1, "checkpoint_every": 1, "evaluate_every": 0}
         for name, bound in least.items():
             value = getattr(self, name)
