@@ -162,7 +162,7 @@ def test_records_of_policies_name_the_least_gradient_steps_only_where_these_bind
     monkeypatch.setattr(comparison.stages, "run", lambda name, content, *_, **__: told.update({name: content}))
     for algorithm in ("sac", "td3", "ppo"):
         for budget in (10_000, 20_000, 100_000):
-            comparison._policy(algorithm, 0, budget)
+            comparison.policy(algorithm, 0, budget)
     bound = {name for name, content in told.items() if "least_updates" in content}
     assert bound == {"policy_sac_0_100000", "policy_td3_0_100000"}  # else all of fewer hops would be trained again
 

@@ -146,9 +146,9 @@ def test_a_comparison_keeps_a_training_until_its_policy_is_written(tmp_path: Pat
     with monkeypatch.context() as patch:
         patch.setattr(ActorPolicy, "save", full_disk)
         with pytest.raises(OutputFolderError):
-            comparison._policy("sac", 0, 16)
+            comparison.policy("sac", 0, 16)
     assert state.exists()
-    comparison._policy("sac", 0, 16)
+    comparison.policy("sac", 0, 16)
     assert not state.exists()
 
 

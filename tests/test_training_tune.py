@@ -132,7 +132,7 @@ def test_a_comparison_takes_hyperparameters_from_a_folder(tmp_path: Path) -> Non
 
     def policy(config: CompareConfig) -> run.Comparison:
         comparison = run.Comparison(config)
-        comparison._policy("sac", 0, 16)
+        comparison.policy("sac", 0, 16)
         return comparison
 
     first = policy(small)

@@ -104,7 +104,7 @@ class Comparison:
         self._oracle()
         for seed, budget in config.policy_runs:
             for method in config.policies:
-                self._policy(method, seed, budget)
+                self.policy(method, seed, budget)
         if config.latencies:
             self._latency()
 
@@ -272,7 +272,8 @@ class Comparison:
         """The file of an algorithm's hyper-parameters, None for the committed one."""
         return self.config.hyperparameters and self.config.hyperparameters / f"{algorithm}.toml"
 
-    def _policy(self, method: str, seed: int, budget: int) -> None:
+    def policy(self, method: str, seed: int, budget: int) -> None:
+        """Train a policy, and score it."""
         from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
 
         algorithm, symmetric = self.config.policies[method]
