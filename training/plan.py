@@ -25,7 +25,7 @@ from tensegrity_gym.types import Floats
 from training.inverse import START_SEED, InverseConfig, InversePlanner, fit_energy
 from training.planner import Land, targets_of
 from training.refine import RefiningPlanner
-from training.varied import VARIED_STARTS, VariedPlanner, fit_varied_kriging
+from training.varied import VariedPlanner, fit_varied_kriging, inverse_planners
 
 
 @dataclass(frozen=True)
@@ -141,18 +141,8 @@ def _maker(
     of_all: Mapping[str, Any],
 ) -> Callable[[Floats], InversePlanner]:
     """Scene values in observed order (k,) [SI] to the planner of that scene; what all scenes share is fitted once."""
-    landing = FrozenLanding(net, scenes.observed)
-    varied = fit_varied_kriging(net, known, scenes, known.split(held, 0.0), floor)
-    settings = replace(config, starts=max(VARIED_STARTS, config.starts))
-
-    @one_thread()
-    def make(values: Floats) -> InversePlanner:
-        planner = InversePlanner(landing.at(values), settings, **of_all)
-        if varied is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
-            planner.correction = varied.at(values)
-        return planner
-
-    return make
+    kriging = fit_varied_kriging(net, known, scenes, known.split(held, 0.0), floor)
+    return inverse_planners(FrozenLanding(net, scenes.observed), kriging, config, **of_all)
 
 
 def _check_scene(net: HopNet, at: Mapping[str, float] | None) -> None:

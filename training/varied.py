@@ -6,6 +6,7 @@ Lengths made alike (see ``similarity``) let what is learnt in one gravity serve 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from surrogate.model import HopNet, one_thread
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import Floats
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.inverse import InverseConfig, InversePlanner
 from training.planner import Images, NearestHopPlanner, Planner, Prediction, targets_of, with_images
 from training.similarity import alike
 
@@ -180,6 +182,22 @@ class VariedKriging:
         """The correction in the scene of ``values`` (k,) [SI]; see ``Kriging``."""
         scene = torch.from_numpy(((unit_values(values[None], self.scenes) * self.weights)[0]).astype(np.float32))
         return lambda s: self.process(torch.cat([s, scene.expand(*s.shape[:-1], len(scene))], dim=-1))
+
+
+def inverse_planners(
+    landing: FrozenLanding, kriging: VariedKriging | None, config: InverseConfig, **of_all: Any
+) -> Callable[[Floats], InversePlanner]:
+    """Scene values in observed order (k,) [SI] to the robust planner of that scene; ``of_all``: what all of them are told."""
+    settings = replace(config, starts=max(VARIED_STARTS, config.starts))
+
+    @one_thread()
+    def make(values: Floats) -> InversePlanner:
+        planner = InversePlanner(landing.at(values), settings, **of_all)
+        if kriging is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
+            planner.correction = kriging.at(values)
+        return planner
+
+    return make
 
 
 @one_thread()

@@ -30,13 +30,13 @@ from training.similarity import alike_data, likeness
 from training.stages import Results
 from training.tandem import TandemPlanner
 from training.varied import (
-    VARIED_STARTS,
     NearestVariedHops,
     ScaledScenes,
     VariedEvolution,
     VariedKriging,
     VariedPlanner,
     fit_varied_kriging,
+    inverse_planners,
     scene_values,
 )
 
@@ -154,7 +154,6 @@ class VariedFitted:
 
     def _robust(self) -> VariedPlanner:
         """All that its planners of one scene share is fitted here, so that its time counts as making this one."""
-        _ = self.kriging, self.energy
         return self.comparison.of_scenes(self.planner)
 
     @cached_property
@@ -179,15 +178,13 @@ class VariedFitted:
         """The robust planner, which others build on."""
         return self["ensemble"]
 
-    @one_thread()
-    def planner(self, values: Floats) -> InversePlanner:
-        """The robust planner of one scene, of ``values`` (k,) [SI]."""
-        settings = replace(self.config.inverse, starts=max(VARIED_STARTS, self.config.inverse.starts))
+    @cached_property
+    def planner(self) -> Callable[[Floats], InversePlanner]:
+        """Scene values (k,) [SI] to the robust planner of that scene."""
         images = self.net.landing_images
-        planner = InversePlanner(self.landing.at(values), settings, energy=self.energy, images=images, seed=self.seed)
-        if self.kriging is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
-            planner.correction = self.kriging.at(values)
-        return planner
+        return inverse_planners(
+            self.landing, self.kriging, self.config.inverse, energy=self.energy, images=images, seed=self.seed
+        )
 
     @one_thread()
     def _of_one_net(self, values: Floats) -> InversePlanner:
