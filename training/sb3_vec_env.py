@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +16,9 @@ from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.types import HopStatus
 from training.similarity import Scaling
 from training.symmetry import FoldedTargets, Symmetry
+
+#: How seeds of envs come from that of a training; trainings that began otherwise are others.
+ENV_SEEDS = "drawn from it"
 
 
 class ScaledObservation(gym.ObservationWrapper):
@@ -71,9 +74,9 @@ def make_env(scene: Scene | SceneRanges, scale: float | Scaling, leader: gym.Env
 
 
 class BatchedHopVecEnv(DummyVecEnv):
-    """``envs`` of :func:`make_env`; gives what DummyVecEnv gives, bit by bit.
+    """``envs`` of :func:`make_env`; gives what DummyVecEnv with the same seeds gives, bit by bit.
 
-    Targets, seeds, spaces and observations are the envs' own, rewards come from the same function that they call; only
+    Targets, spaces and observations are the envs' own, rewards come from the same function that they call; only
     ``simulate`` is called once for all of them. Where scenes vary, the first env draws one for all at each reset, as the
     registered vector env does with ``shared_scene``. Infos hold ``landing`` (2,) [m], ``error`` [m] and ``status``.
     ``levers``: further arguments of ``simulate``; with a ``symmetry`` policies see folded targets, see ``FoldedTargets``.
@@ -101,6 +104,12 @@ class BatchedHopVecEnv(DummyVecEnv):
         self.simulator_calls = 0
         #: Wall time that simulating them took [s].
         self.seconds = 0.0
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the envs with numbers drawn from ``seed``; with seed + k, as usual, neighbouring seeds share most targets."""
+        first = super().seed(seed)[0]
+        self._seeds = [int(drawn) for drawn in np.random.SeedSequence(first).generate_state(self.num_envs)]
+        return self._seeds
 
     def step_wait(self) -> Any:
         """Simulate one hop per env; every episode ends, and every env is reset."""

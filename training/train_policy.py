@@ -25,7 +25,7 @@ from tensegrity_gym.task import check_fidelity
 from training import checkpoint
 from training.algorithms import build, check_rollout, env_count, hyperparameters, updates_per_hop
 from training.policies import ActorPolicy
-from training.sb3_vec_env import BatchedHopVecEnv
+from training.sb3_vec_env import ENV_SEEDS, BatchedHopVecEnv
 from training.similarity import Scaling
 from training.symmetry import Symmetry
 
@@ -206,7 +206,7 @@ def train_policy(
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
     plain, told = asdict(config) | {"hyperparameters": values}, asdict(scenes if scenes.ranges else scenes.base)
-    decisive: dict[str, Any] = {"config": plain, "scene": told, "budgets": sorted(budgets)}
+    decisive: dict[str, Any] = {"config": plain, "scene": told, "budgets": sorted(budgets), "env_seeds": ENV_SEEDS}
     if "updates" in values:
         decisive["updates_per_hop"] = updates_per_hop(values, config.calls)
     settings = hash_of(decisive)

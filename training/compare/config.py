@@ -84,7 +84,10 @@ class CompareConfig:
     threads: int | None = None
     """Threads of the simulator; None: all cores."""
     write: bool = False
-    """Write tables and figures into docs/results.md, docs/images and README.md of the working directory."""
+    """Go on from the scores in docs/scores of the working directory, running only what they lack, and write all scores there,
+    tables and figures into docs/results.md, docs/images and README.md."""
+    anew: bool = False
+    """With --write: begin without the scores in docs/scores, which are then overwritten."""
     quick: bool = False
     """A run of under a minute, with hops cut off after 0.06 s, that shows that all works, and nothing else."""
     progress: bool = True
@@ -95,6 +98,10 @@ class CompareConfig:
             raise InvalidParameterError(
                 "write: expected it without --quick, got both: hops cut off after 0.06 s would overwrite the measured results in "
                 "README.md and docs; leave one of them out"
+            )
+        if self.anew and not self.write:
+            raise InvalidParameterError(
+                "anew: expected it with --write, without which no kept scores are gone on from; leave it out"
             )
         if self.second and self.write:
             raise InvalidParameterError("write: expected the first targets, which the tables are of, got second; leave one out")
@@ -172,6 +179,16 @@ class CompareConfig:
             tandem=replace(self.tandem, steps=20),
             latencies=2,
         )
+
+    @property
+    def kept_path(self) -> Path:
+        """Where scores are kept beside the tables made of them."""
+        return Path("docs/scores") / f"{self.scene}_{self.landing}.jsonl"
+
+    @property
+    def kept(self) -> Path | None:
+        """The file of scores to go on from, None for none."""
+        return self.kept_path if self.write and not self.anew else None
 
     @property
     def budgets_of_policies(self) -> tuple[int, ...]:

@@ -14,7 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from surrogate.figures import COLOURS, STYLE
-from training.compare.results import Outcome, label
+from training.compare.methods import label
+from training.compare.results import Outcome
 from training.compare.statistics import performance_profile
 from training.figures import save
 
@@ -33,8 +34,8 @@ def _levels(axes: Axes, outcome: Outcome, along: str = "y") -> None:
     draw = axes.axhline if along == "y" else axes.axvline
     draw(outcome.factor * outcome.floor, color="#888888", ls=":", label="floor: start moved by 10 µm")
     draw(outcome.factor * outcome.scatter, color="#888888", ls=(0, (1, 4)), label="scatter of the best answers")
-    if outcome.oracle is not None:
-        draw(outcome.factor * outcome.oracle, color="#888888", ls="--", label="CMA-ES on the simulator")
+    if outcome.oracle_error is not None:
+        draw(outcome.factor * outcome.oracle_error, color="#888888", ls="--", label="CMA-ES on the simulator")
 
 
 def sample_efficiency(outcome: Outcome, path: Path) -> Path:
@@ -56,17 +57,17 @@ def sample_efficiency(outcome: Outcome, path: Path) -> Path:
 
 
 def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
-    """Share of landings within a radius of the target, at one budget."""
+    """Share of answers that err by less than a radius, at one budget."""
     radii = np.geomspace(6e-4, 2, 200) * float((outcome.reaches / outcome.unit).max())
     with _style():
         figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
         for method in (m for m in outcome.methods if budget in outcome.budgets(m)):
-            share = performance_profile(outcome.landing_errors(method, budget, "inside"), radii)
+            share = performance_profile(outcome.errors(method, budget), radii)
             look = _look(outcome.methods.index(method)) | {"marker": None}
             axes.plot(outcome.factor * radii, 100 * share, label=label(method), **look)  # type: ignore[arg-type]
         _levels(axes, outcome, along="x")
         axes.set(
-            xscale="log", xlabel=f"radius around the target [{outcome.shown}]", ylabel="landings within it [%]", ylim=(0, 101)
+            xscale="log", xlabel=f"radius around the target [{outcome.shown}]", ylabel="answers within it [%]", ylim=(0, 101)
         )
         axes.xaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)

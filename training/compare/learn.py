@@ -32,9 +32,6 @@ from training.inverse import InversePlanner, fit_energy
 from training.planner import NearestHopPlanner, Planner
 from training.tandem import TandemPlanner
 
-#: Planners that simulate nothing, by name; in this order in tables.
-PLANNERS = ("nearest", "single", "ensemble", "tandem", "cma")
-
 #: Parts of a file at whose beginnings seeds begin.
 PARTS = 10
 

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from surrogate.storage import atomic_path, ensure_folder, package_versions
+from surrogate.storage import atomic_path, ensure_folder
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.task import SUCCESS_RADIUS, TARGET_PLACES
 from training.compare import figures
-from training.compare.results import Outcome, Summary, answer_calls, label
+from training.compare.methods import ORACLE, answer_calls, label
+from training.compare.results import Outcome, Summary
 from training.compare.statistics import FEWEST_SEEDS, interquartile_mean
 
 
@@ -64,9 +65,9 @@ def caption(outcome: Outcome) -> str:
     """What the table of :func:`by_budget` shows, and when it was run."""
     config, (first, last) = outcome.comparison.config, outcome.dates
     oracle, which = "", "second " if config.second else ""
-    if outcome.oracle is not None:
-        calls = outcome.records["oracle"]["calls_per_answer"]
-        oracle = f" CMA-ES on the simulator, {calls:.0f} hops an answer, comes to {_shown(outcome, outcome.oracle)}."
+    if outcome.oracle is not None and outcome.oracle_error is not None:
+        calls = outcome.oracle.calls_per_answer
+        oracle = f" CMA-ES on the simulator, {calls:.0f} hops an answer, comes to {_shown(outcome, outcome.oracle_error)}."
     text = (
         f"Interquartile mean landing error over {len(outcome.comparison.places['inside'])} {which}targets inside the reachable "
         f"region and training seeds, after so many simulator calls learnt from; {config.perturbations} starts an answer, moved "
@@ -81,9 +82,9 @@ def caption(outcome: Outcome) -> str:
 def by_place(outcome: Outcome) -> str:
     """Errors inside, on the boundary and beyond it, of each method at its largest budget."""
     rows = []
-    for m in [*outcome.methods, *(["oracle"] if outcome.oracle is not None else [])]:
+    for m in [*outcome.methods, *([ORACLE] if outcome.oracle is not None else [])]:
         budget = outcome.budgets(m)[-1]
-        name = "CMA-ES on the simulator" if m == "oracle" else label(m)
+        name = "CMA-ES on the simulator" if m == ORACLE else label(m)
         cells = [f"{outcome.factor * outcome.summary(m, budget, place).mean:.3g}" for place in TARGET_PLACES]
         rows.append([name, _spaced(budget), *cells])
     return table([f"error [{outcome.shown}] of targets", "calls", *TARGET_PLACES], rows)
@@ -151,7 +152,7 @@ def section(outcome: Outcome, pictures: str) -> str:
 
 Model version {MODEL_VERSION}, fidelity {config.fidelity}, {_scene(outcome)},
 targets {", ".join(f"{n} {p}" for p, n in rows.items())}, {config.perturbations} moved starts an answer,
-{package_versions_text()}.
+{"; ".join(outcome.versions)}.
 
 {caption(outcome)}
 
@@ -165,10 +166,15 @@ At the largest budget of each:
 
 {by_place(outcome)}
 {chr(10) + by_gravity(outcome) + chr(10) if outcome.varied else ""}
-![Share of landings within a radius of the target, after {budget:,} calls]({pictures}/results_{name}_profile.png)
+![Share of answers that err by less than a radius, after {budget:,} calls]({pictures}/results_{name}_profile.png)
 
 ![Learning time against error]({pictures}/results_{name}_pareto.png)
 """
+
+
+def short(outcome: Outcome) -> str:
+    """The one table that README has, and what it shows."""
+    return f"{caption(outcome)}\n\n{by_budget(outcome)}"
 
 
 def _shown(outcome: Outcome, value: float) -> str:
@@ -181,12 +187,6 @@ def _scene(outcome: Outcome) -> str:
         return f"reach {most:.0f} mm"
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in outcome.comparison.scenes.ranges.items())
     return f"{ranges},\nreaches of the targets' scenes {least:.0f} to {most:.0f} mm"
-
-
-def package_versions_text() -> str:
-    """Versions that results may depend on."""
-    kept = package_versions()
-    return ", ".join(f"{name} {kept[name]}" for name in ("torch", "stable-baselines3") if name in kept)
 
 
 def tag(outcome: Outcome) -> str:
@@ -207,7 +207,7 @@ def write_all(outcome: Outcome, page: Path, images: Path, readme: Path | None = 
     relative = Path(os.path.relpath(images, page.parent)).as_posix()
     replace_between(page, name, section(outcome, relative), append=True)
     written.append(page)
-    if readme is not None and readme.exists() and replace_between(readme, name, f"{caption(outcome)}\n\n{by_budget(outcome)}"):
+    if readme is not None and readme.exists() and replace_between(readme, name, short(outcome)):
         written.append(readme)
     return written
 

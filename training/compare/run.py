@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
@@ -15,17 +14,21 @@ import numpy as np
 from surrogate import dataset, model
 from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
-from surrogate.model import HopNet, one_thread
-from surrogate.storage import CARD, POLICY_STATE, beside
+from surrogate.model import HopNet
+from surrogate.storage import CARD, beside, hash_of, package_versions
+from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.task import check_fidelity, reach
 from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
+from training.compare import latency
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
-from training.compare.learn import PLANNERS, Fitted, fit_net, from_file, model_of, simulated
+from training.compare.learn import Fitted, fit_net, from_file, model_of, simulated
+from training.compare.methods import BAYESIAN, ORACLE, PLANNERS, REFINED, answer_calls, begins_from
+from training.compare.scores import Score, Scores, measure, rounded
+from training.compare.statistics import interquartile_mean
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.hops import Hops
 from training.planner import BestOfPlanner, Planner
-from training.policies import ActorPolicy
 from training.refine import RefiningPlanner
 from training.stages import Results, Stages
 
@@ -33,12 +36,8 @@ from training.stages import Results, Stages
 BLOCK = 2048
 #: Random hops that the floor is measured on.
 FLOOR_HOPS = 64
-#: Planners whose answers hops in turn may begin from, and what the methods that do so are called, before how many they are.
-REFINED = {"nearest": "repeat", "ensemble": "refine"}
-#: How the names of methods begin that simulate some hops for each answer, whose number follows, and what they begin from.
-SIMULATING = {"best": "ensemble", "repeat": "nearest", "refine": "ensemble", "bayes": "ensemble"}
-#: Targets of questions whose latency is measured.
-LATENCY_SEED = 5
+#: Packages whose versions are noted with scores.
+NOTED = ("torch", "stable-baselines3")
 
 
 class Comparison:
@@ -54,15 +53,6 @@ class Comparison:
         self.config = config
         if config.bayes:
             require_botorch()
-        learning = {algorithm for algorithm, _ in config.policies.values()}
-        if config.hyperparameters is not None or "ppo" in learning:
-            from training.train_policy import PolicyConfig, check_calls  # stable-baselines3 takes seconds to import
-
-            for algorithm in learning:  # what no policy can learn from is refused now, not after all planners
-                for budget in config.budgets_of_policies:
-                    check_calls(
-                        PolicyConfig(algorithm, calls=budget, hyperparameters=self._source(algorithm), **self.policy_settings)
-                    )
         changes = {} if config.duration is None else {"duration": config.duration}
         self.scenes = registered.scenes_of(config.scene, config.landing, **changes)
         self.scene = self.scenes.base
@@ -72,8 +62,16 @@ class Comparison:
             config.scene, config.landing, config.targets, registered.SECOND if config.second else registered.PATH
         )
         self.targets = np.concatenate(list(self.places.values()))
+        #: Which targets are of a place, shape (targets,).
+        self.rows = {p: np.repeat([p == q for q in self.places], [len(t) for t in self.places.values()]) for p in self.places}
         #: What every stage's record depends on.
-        self.base = {"scene": asdict(self.scene), "fidelity": config.fidelity}
+        self.base = {"scene": asdict(self.scene), "fidelity": config.fidelity} | self._varying()
+        #: What the methods are judged by: kept scores, where there are some, and those of this run.
+        self.scores = Scores(self.task) if config.kept is None else Scores.read(config.kept, self.task)
+        if config.hyperparameters is not None or "ppo" in {algorithm for algorithm, _ in config.policies.values()}:
+            from training.compare import policies
+
+            policies.check(self)
         self._fitted: dict[tuple[int, int], Fitted] = {}
         self._pools: dict[int, HopData] = {}
 
@@ -85,28 +83,84 @@ class Comparison:
         """Reach of the scene of each target, shape (n,) [m]."""
         return np.full(len(self.targets), reach(self.scene))
 
+    def _varying(self) -> dict[str, Any]:
+        """What records depend on where scenes vary."""
+        return {}
+
+    @property
+    def units(self) -> np.ndarray:
+        """What lengths are divided by in scores: metres, shape (n,) [m]."""
+        return np.ones(len(self.targets))
+
+    @property
+    def task(self) -> dict[str, Any]:
+        """What all scores have in common."""
+        counts = {place: len(targets) for place, targets in self.places.items()}
+        given = {"perturbations": self.config.perturbations, "places": counts, "targets": hash_of(self.targets.tolist())}
+        return self.base | given | {"model_version": MODEL_VERSION}
+
     def run(self) -> None:
-        """All stages, cheap ones first."""
+        """All stages whose scores are not kept, cheap ones first."""
         config = self.config
         if not find_spec("cma"):
             self.stages.say("cma: not installed, so its rows and the oracle are left out; pip install 'tensegrity-gym[cma]'")
-        self._floor()
+        if self.scores.floor is None:
+            self._floor()
         for seed, budget in config.planner_runs:
-            self._planners(seed, budget)
-            if config.tries_seeds is None or seed < config.tries_seeds:
-                for tries in config.tries:
-                    self._best_of(tries, seed, budget)
-            for tries in config.refine:
-                for start in self.starts:
-                    self._refined(start, tries, seed, budget)
-            if config.bayes and (config.bayes_seeds is None or seed < config.bayes_seeds):
-                self._bayesian(seed, budget)
+            if not self._is_kept(self._planner_settings(seed), seed, budget):
+                self._planner_run(seed, budget)
         self._oracle()
         for seed, budget in config.policy_runs:
             for method in config.policies:
                 self.policy(method, seed, budget)
         if config.latencies:
-            self._latency()
+            latency.measure(self)
+
+    def _is_kept(self, settings: Mapping[str, Any], seed: int, budget: int) -> bool:
+        """Whether the kept scores have all these methods, with their settings."""
+        kept = all(self.scores.holds(method, budget, seed, hash_of(content)) for method, content in settings.items())
+        if kept:
+            self.stages.say(f"seed {seed} after {budget} calls: scores of {', '.join(settings)} kept")
+        return kept
+
+    def _planner_run(self, seed: int, budget: int) -> None:
+        """All planners of one seed and budget."""
+        self._floor()
+        self._planners(seed, budget)
+        for method, (stage, make) in self.trying(seed).items():
+            self._tried(method, stage, make, seed, budget)
+
+    def require_planners(self, seed: int, budget: int) -> None:
+        """Have the nets and plans of a seed and budget, though their scores may be kept."""
+        if f"plans_{seed}_{budget}" not in self.stages.results:
+            self._planner_run(seed, budget)
+
+    def trying(self, seed: int) -> dict[str, tuple[str, Callable[[Any], Planner]]]:
+        """Methods that simulate hops for each answer: their stage, and how they are made of what was fitted."""
+        config = self.config
+        found: dict[str, tuple[str, Callable[[Any], Planner]]] = {}
+        if config.tries_seeds is None or seed < config.tries_seeds:
+            found |= {f"best{t}": (f"best{t}", partial(self._best, tries=t)) for t in config.tries}
+        for tries in config.refine:
+            methods = {f"{REFINED[start]}{tries}": start for start in self.starts}
+            found |= {m: (m, partial(self._refining, start=start, tries=tries)) for m, start in methods.items()}
+        if config.bayes and (config.bayes_seeds is None or seed < config.bayes_seeds):
+            found[f"{BAYESIAN}{config.bayes}"] = (BAYESIAN, partial(self._optimising, tries=config.bayes))
+        return found
+
+    def trying_settings(self, method: str) -> dict[str, Any]:
+        """What answers of a method that simulates hops depend on besides plans."""
+        settings: dict[str, Any] = {"tries": answer_calls(method)}
+        if method.startswith(tuple(REFINED.values())):
+            settings["method"] = "secant, stretches held at the ends of their range"
+        if method.startswith(BAYESIAN):
+            settings["process"] = asdict(BayesianConfig())
+        return settings
+
+    def _planner_settings(self, seed: int) -> dict[str, dict[str, Any]]:
+        """What scores of the planners of a seed depend on besides seed and budget, by method."""
+        plans = self.learning | self.planning
+        return dict.fromkeys(self.names, plans) | {m: plans | self.trying_settings(m) for m in self.trying(seed)}
 
     def pool(self, seed: int) -> HopData:
         """The hops of a seed: as many as the largest budget; smaller budgets are its first rows."""
@@ -145,11 +199,16 @@ class Comparison:
         return HopData(found.columns, configuration, found.seconds)
 
     def _floor(self) -> None:
-        def work() -> Results:
-            landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations)
-            return {"distances": np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2).tolist()}
+        if "floor" in self.stages.results:
+            return
+        found = self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, self._moved_hops)
+        moved = np.array(found["distances"]).mean(axis=1) / np.array(found.get("reaches", 1.0))
+        self.scores.floor = rounded(float(interquartile_mean(moved)))
 
-        self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, work)
+    def _moved_hops(self) -> Results:
+        """How far moved starts carry random hops [m]."""
+        landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations)
+        return {"distances": np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2).tolist()}
 
     @property
     def floor(self) -> float:
@@ -176,22 +235,33 @@ class Comparison:
             model.save(net, path, card)
             return {"seconds": card["seconds"]}
 
-        settings = {"surrogate": asdict(config.surrogate), "updates": config.updates}
         files = [path.name, beside(path, CARD).name]
-        self.stages.run(f"net_{tag}", settings, learn, needs=[f"hops_{tag}"], files=files)
+        self.stages.run(f"net_{tag}", self.learning, learn, needs=[f"hops_{tag}"], files=files)
 
         def plan() -> Results:
             fitted = self.fitted(seed, budget)
             answers = {name: fitted[name].predict(self.targets)[0].tolist() for name in self.names}
             return {name: {"stretches": answers[name], "seconds": fitted.seconds[name]} for name in self.names}
 
-        settings = self._planning | {"planners": self.names}
+        settings = self.planning | {"planners": self.names}
         self.stages.run(f"plans_{tag}", settings | {"targets": self.targets.tolist()}, plan, needs=[f"net_{tag}", "floor"])
-        for name in self.names:
-            self._score(name, seed, budget, f"plans_{tag}", partial(self._kept, f"plans_{tag}", name))
+        for name, content in self._planner_settings(seed).items():
+            if name in self.names:
+                answers = partial(self._planned, f"plans_{tag}", name)
+                self.score(name, seed, budget, f"plans_{tag}", answers, content, self._learnt_in(name, tag))
 
     @property
-    def _planning(self) -> dict[str, Any]:
+    def learning(self) -> dict[str, Any]:
+        """What nets depend on besides hops."""
+        return {"surrogate": asdict(self.config.surrogate), "updates": self.config.updates}
+
+    def _learnt_in(self, planner: str, tag: str) -> float:
+        """Wall time that a planner learnt for, simulating left out [s]."""
+        own = float(self.stages.results[f"plans_{tag}"][planner]["seconds"])
+        return own + (0.0 if planner == "nearest" else self.stages.seconds[f"net_{tag}"])
+
+    @property
+    def planning(self) -> dict[str, Any]:
         """What plans depend on besides nets and targets."""
         config = self.config
         return {
@@ -201,7 +271,7 @@ class Comparison:
             "images": True,  # of stored hops, which planners did without before
         }
 
-    def _kept(self, stage: str, name: str) -> Results:
+    def _planned(self, stage: str, name: str) -> Results:
         return self.stages.results[stage][name]
 
     @property
@@ -209,31 +279,18 @@ class Comparison:
         """Planners that can run here."""
         return [name for name in PLANNERS if name != "cma" or find_spec("cma")]
 
-    def _best_of(self, tries: int, seed: int, budget: int) -> None:
-        self._tried(f"best{tries}", f"best{tries}", {"tries": tries}, lambda fitted: self._best(fitted, tries), seed, budget)
-
-    def _refined(self, start: str, tries: int, seed: int, budget: int) -> None:
-        method = f"{REFINED[start]}{tries}"
-        settings = {"tries": tries, "method": "secant, stretches held at the ends of their range"}
-        self._tried(method, method, settings, lambda fitted: self._refining(fitted, start, tries), seed, budget)
-
-    def _bayesian(self, seed: int, budget: int) -> None:
-        tries = self.config.bayes
-        settings = {"tries": tries, "process": asdict(BayesianConfig())}
-        self._tried(f"bayes{tries}", "bayes", settings, lambda fitted: self._optimising(fitted, tries), seed, budget)
-
-    def _tried(
-        self, method: str, stage: str, settings: Results, planner: Callable[[Any], Planner], seed: int, budget: int
-    ) -> None:
+    def _tried(self, method: str, stage: str, make: Callable[[Any], Planner], seed: int, budget: int) -> None:
         """Answers of a planner that tries hops, and their score."""
         tag = f"{seed}_{budget}"
         name = f"{stage}_{tag}"
 
         def work() -> Results:
-            return {"stretches": planner(self.fitted(seed, budget)).predict(self.targets)[0].tolist()}
+            return {"stretches": make(self.fitted(seed, budget)).predict(self.targets)[0].tolist()}
 
-        self.stages.run(name, settings, work, needs=[f"plans_{tag}"])
-        self._score(method, seed, budget, name, lambda: self.stages.results[name])
+        self.stages.run(name, self.trying_settings(method), work, needs=[f"plans_{tag}"])
+        settings = self._planner_settings(seed)[method]
+        seconds = self._learnt_in(begins_from(method), tag)
+        self.score(method, seed, budget, name, lambda: self.stages.results[name], settings, seconds)
 
     def _best(self, fitted: Any, tries: int) -> Planner:
         return BestOfPlanner(fitted.inverse, self.hops.land, tries)
@@ -247,17 +304,20 @@ class Comparison:
     def _oracle(self) -> None:
         if not self.config.oracle or not find_spec("cma"):
             return
-
         budget = max(self.config.budgets)
+        settings = {"search": asdict(self._search), "images": True}
+        if self._is_kept({ORACLE: settings}, 0, budget):
+            return
+        self.require_planners(0, budget)
 
         def work() -> Results:
             before = self.hops.calls
             stretches, _ = self._search_from(self.fitted(0, budget)["nearest"]).predict(self.targets)
             return {"stretches": stretches.tolist(), "calls_per_answer": (self.hops.calls - before) / len(self.targets)}
 
-        settings = {"search": asdict(self._search), "targets": self.targets.tolist(), "images": True}
-        self.stages.run("oracle", settings, work, needs=[f"net_0_{budget}"])
-        self._score("oracle", 0, budget, "oracle", lambda: self.stages.results["oracle"])
+        self.stages.run(ORACLE, settings | {"targets": self.targets.tolist()}, work, needs=[f"net_0_{budget}"])
+        calls = self.stages.results[ORACLE]["calls_per_answer"]
+        self.score(ORACLE, 0, budget, ORACLE, lambda: self.stages.results[ORACLE], settings, 0.0, calls)
 
     def _search_from(self, start: Planner) -> Planner:
         """CMA-ES on the simulator."""
@@ -268,54 +328,32 @@ class Comparison:
         # the nearest stored hop is near already, and the map is rough: a wide first generation would only lose it
         return EvolutionConfig(self.config.oracle, min(8, self.config.oracle), sigma=0.01)
 
-    def _source(self, algorithm: str) -> Path | None:
-        """The file of an algorithm's hyper-parameters, None for the committed one."""
-        return self.config.hyperparameters and self.config.hyperparameters / f"{algorithm}.toml"
-
     def policy(self, method: str, seed: int, budget: int) -> None:
-        """Train a policy, and score it."""
-        from training.train_policy import PolicyConfig, train_policy  # stable-baselines3 takes seconds to import
+        """Train a policy, and score it, unless its score is kept."""
+        from training.compare import policies  # stable-baselines3 takes seconds to import
 
-        algorithm, symmetric = self.config.policies[method]
-        name = f"policy_{method}_{seed}_{budget}"
-        path = self.stages.folder / f"{name}.safetensors"
-        source = self._source(algorithm)
-        settings = PolicyConfig(
-            algorithm,
-            calls=budget,
-            seed=seed,
-            symmetric=symmetric,
-            fidelity=self.config.fidelity,
-            hyperparameters=source,
-            **self.policy_settings,
-        )
+        if not self._is_kept({method: policies.settings_of(self, method, 0, budget)}, seed, budget):
+            policies.run(self, method, seed, budget)
 
-        def work() -> Results:
-            state = beside(path, POLICY_STATE)
-            actors, card = train_policy(
-                self.scenes, settings, progress=self.config.progress, state=state, threads=self.config.threads
-            )
-            actors[budget].save(path, card)
-            state.unlink(missing_ok=True)
-            return {
-                "seconds": card["seconds"],
-                "simulating": card["simulating_seconds"],
-                "values": card["train"]["hyperparameters"],
-            }
+    def require_policy(self, method: str, seed: int, budget: int) -> None:
+        """Have a policy's files, though its score may be kept."""
+        from training.compare import policies
 
-        from training.algorithms import LEAST_UPDATES, hyperparameters, is_cap_passed
+        if f"policy_{method}_{seed}_{budget}" not in self.stages.results:
+            policies.run(self, method, seed, budget)
 
-        values = hyperparameters(algorithm, source)
-        # what stands in the file counts, not where it lies; policies from before some could know symmetries say nothing of them
-        told = {k: v for k, v in asdict(settings).items() if k != "symmetric" or v}
-        content: dict[str, Any] = self.base | {"config": told | {"hyperparameters": None}, "values": values}
-        if is_cap_passed(values, budget):
-            content["least_updates"] = LEAST_UPDATES  # trained before there was a least, a policy of so many hops is another
-        self.stages.run(name, content, work, files=[path.name, beside(path, CARD).name])
-        self._score(method, seed, budget, name, lambda: {"stretches": ActorPolicy.load(path).predict(self.targets)[0]})
-
-    def _score(self, method: str, seed: int, budget: int, needs: str, answers: Callable[[], Any]) -> None:
-        """Simulate the answers of a method, from their start and from moved ones."""
+    def score(
+        self,
+        method: str,
+        seed: int,
+        budget: int,
+        needs: str,
+        answers: Callable[[], Any],
+        settings: Mapping[str, Any],
+        seconds: float,
+        calls_per_answer: float | None = None,
+    ) -> None:
+        """Simulate the answers of a method, from their start and from moved ones, and take down how near they come."""
 
         def work() -> Results:
             stretches = np.array(answers()["stretches"])
@@ -323,49 +361,24 @@ class Comparison:
             return {"stretches": stretches.tolist(), "landings": landings.tolist()}
 
         content = self.base | {"perturbations": self.config.perturbations, "targets": self.targets.tolist()}
-        self.stages.run(f"score_{method}_{seed}_{budget}", content, work, needs=[needs])
-
-    def _latency(self) -> None:
-        budget = max(self.config.budgets)
-        largest = max(self.config.budgets_of_policies, default=None)
-        policies = {m: f"policy_{m}_0_{largest}" for m in self.config.policies if largest}
-
-        def work() -> Results:
-            fitted = self.fitted(0, budget)
-            asked: dict[str, Planner] = {name: fitted[name] for name in self.names}
-            asked |= {f"best{t}": self._best(fitted, t) for t in self.config.tries}
-            asked |= {f"{REFINED[s]}{t}": self._refining(fitted, s, t) for t in self.config.refine for s in self.starts}
-            asked |= {m: ActorPolicy.load(self.stages.folder / f"{name}.safetensors") for m, name in policies.items()}
-            return {name: self._questions(planner, name) for name, planner in asked.items()}
-
-        needs = [f"net_0_{budget}", *policies.values()]
-        content = {"questions": self.config.latencies, "tries": self.config.tries, "refine": self.config.refine} | self._planning
-        # threads: of torch; times from before, with all, are measured again
-        how = {"threads": 1, "planners": self.names, "targets": self.places["inside"].tolist()}
-        self.stages.run("latency", content | how, work, needs=needs)
-        if self.config.bayes and self.config.bayes_seeds != 0:  # apart, so that the others' times stay as they were
-            name, tries = f"bayes{self.config.bayes}", self.config.bayes
-            content = {"questions": self.config.latencies, "tries": tries, "process": asdict(BayesianConfig())} | how
-            self.stages.run(
-                f"latency_{name}",
-                content,
-                lambda: {name: self._questions(self._optimising(self.fitted(0, budget), tries), name)},
-                needs=needs[:1],
+        name = f"score_{method}_{seed}_{budget}"
+        found = self.stages.run(name, content, work, needs=[needs])
+        landings = np.array(found["landings"], dtype=np.float64)[:, 1:]
+        errors, scatter = measure(landings, self.targets[:, :2], self.reaches, self.units, self.rows["inside"])
+        self.scores.add(
+            Score(
+                method,
+                budget,
+                seed,
+                errors,
+                scatter,
+                rounded(seconds),
+                hash_of(settings),
+                self.stages.dates[name][:10],
+                ", ".join(f"{name} {version}" for name, version in package_versions().items() if name in NOTED),
+                calls_per_answer,
             )
-
-    def _questions(self, planner: Planner, name: str) -> list[float]:
-        """Wall times of single questions [s], after two to warm up."""
-        slow = name.startswith(tuple(SIMULATING))
-        count = max(10, self.config.latencies // 2) if slow else self.config.latencies
-        rng = np.random.default_rng(LATENCY_SEED)
-        inside = self.places["inside"]
-        times = []
-        with one_thread():  # as planners ask their nets: tandem, CMA-ES and policies are timed alike
-            for target in inside[rng.integers(len(inside), size=count + 2)]:
-                started = time.perf_counter()
-                planner.predict(target)
-                times.append(time.perf_counter() - started)
-        return times[2:]
+        )
 
 
 def comparison_of(config: CompareConfig) -> Comparison:
@@ -386,7 +399,9 @@ def main(config: CompareConfig) -> None:
     comparison.run()
     outcome = Outcome(comparison)
     folder = comparison.stages.folder
+    comparison.scores.write(folder / "scores.jsonl")
     report.write_all(outcome, folder / "results.md", folder)
     if config.write:
+        comparison.scores.write(config.kept_path)
         report.write_all(outcome, Path("docs/results.md"), Path("docs/images"), Path("README.md"))
     print(f"{report.by_budget(outcome)}\n\n{folder / 'results.md'}")

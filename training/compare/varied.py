@@ -48,9 +48,8 @@ class VariedComparison(Comparison):
     policy_settings: ClassVar[dict[str, Any]] = {"envs": 16}
     starts: ClassVar[tuple[str, ...]] = ("ensemble",)
 
-    def __init__(self, config: CompareConfig) -> None:
-        super().__init__(config)
-        self.base |= {"ranges": {name: list(bounds) for name, bounds in self.scenes.ranges.items()}}
+    def _varying(self) -> dict[str, Any]:
+        return {"ranges": {name: list(bounds) for name, bounds in self.scenes.ranges.items()}}
 
     def _simulator(self) -> VariedHops:
         return VariedHops(self.scenes, check_fidelity(self.config.fidelity), self.config.threads)
@@ -59,6 +58,11 @@ class VariedComparison(Comparison):
     def reaches(self) -> np.ndarray:
         """Reach of the scene of each target, shape (n,) [m]."""
         return self._reaches(self.targets)
+
+    @property
+    def units(self) -> np.ndarray:
+        """What lengths are divided by in scores: the reach of each target's scene, shape (n,) [m]."""
+        return self.reaches
 
     def _reaches(self, observations: Floats) -> Floats:
         return np.array([reach(self.hops.at(values)) for values in observations[:, 2:]])
@@ -81,18 +85,15 @@ class VariedComparison(Comparison):
         self.stages.run(path.stem, self.base | {"seed": seed, "first": first, "last": last}, work, files=[path.name])
         return dataset.read(path)
 
-    def _floor(self) -> None:
-        def work() -> Results:
-            rng = np.random.default_rng(99)
-            drawn = [self.scenes.sample(rng) for _ in range(FLOOR_HOPS)]
-            values = np.array([[getattr(scene, name) for name in self.scenes.observed] for scene in drawn])
-            asked = np.column_stack([np.zeros((FLOOR_HOPS, 2)), values])
-            landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations, asked)
-            distances = np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2)
-            factor = likeness(values, self.scenes.observed)
-            return {"distances": distances.tolist(), "reaches": self._reaches(asked).tolist(), "likeness": factor.tolist()}
-
-        self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, work)
+    def _moved_hops(self) -> Results:
+        rng = np.random.default_rng(99)
+        drawn = [self.scenes.sample(rng) for _ in range(FLOOR_HOPS)]
+        values = np.array([[getattr(scene, name) for name in self.scenes.observed] for scene in drawn])
+        asked = np.column_stack([np.zeros((FLOOR_HOPS, 2)), values])
+        landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations, asked)
+        distances = np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2)
+        factor = likeness(values, self.scenes.observed)
+        return {"distances": distances.tolist(), "reaches": self._reaches(asked).tolist(), "likeness": factor.tolist()}
 
     @property
     def floor(self) -> float:
