@@ -362,7 +362,7 @@ def test_every_method_is_timed_on_one_thread_and_often_enough() -> None:
 
 def test_one_net_is_asked_alone_and_cards_tell_what_it_learnt_from(folder: Path) -> None:
     comparison = run.Comparison(CompareConfig(out=folder.parent, quick=True, progress=False).shortened())
-    comparison._floor()
+    comparison.measure_floor()
     fitted = comparison.fitted(1, 32)
     stretches = torch.rand(50, 4, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.2
     single = fitted["single"]
@@ -443,7 +443,7 @@ def test_comparison_of_varied_scenes_tells_all_in_reaches_and_goes_on_after_a_lo
 def test_one_net_is_asked_alone_in_each_scene(varied_folder: Path) -> None:
     config = CompareConfig(out=varied_folder.parent, scene="varied", quick=True, progress=False).shortened()
     comparison = run.comparison_of(config)
-    comparison._floor()
+    comparison.measure_floor()
     fitted = comparison.fitted(0, 32)
     stretches = torch.rand(50, 4, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.2
     for values in (np.array([9.0, 0.4]), np.array([2.0, 0.7])):

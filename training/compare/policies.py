@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.storage import CARD, POLICY_STATE, beside
 from training.algorithms import LEAST_UPDATES, hyperparameters, is_cap_passed
+from training.compare.question import How
 from training.policies import ActorPolicy
 from training.sb3_vec_env import ENV_SEEDS
 from training.stages import Results
@@ -68,5 +69,5 @@ def run(comparison: Comparison, method: str, seed: int, budget: int) -> None:
 
     files = [path.name, beside(path, CARD).name]
     found = stages.run(name, settings_of(comparison, method, seed, budget), work, files=files)
-    settings, seconds = settings_of(comparison, method, 0, budget), found["seconds"] - found["simulating"]
-    comparison.score(method, seed, budget, name, answers, settings, seconds)
+    how = How(settings_of(comparison, method, 0, budget), found["seconds"] - found["simulating"])
+    comparison.score(method, seed, budget, name, answers, how)

@@ -2,102 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-
-from surrogate import dataset, model
+from surrogate import model
 from surrogate.dataset import HopData
-from surrogate.generate import sample_stretches
 from surrogate.model import HopNet
-from surrogate.storage import CARD, beside, hash_of, package_versions
-from tensegrity_gym import MODEL_VERSION
-from tensegrity_gym.task import check_fidelity, reach
+from surrogate.storage import CARD, beside
 from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import latency
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
-from training.compare.learn import Fitted, fit_net, from_file, model_of, simulated
+from training.compare.learn import Fitted, fit_net
 from training.compare.methods import BAYESIAN, ORACLE, PLANNERS, REFINED, answer_calls, begins_from
-from training.compare.scores import Score, Scores, measure, rounded
-from training.compare.statistics import interquartile_mean
+from training.compare.question import How, Question
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.hops import Hops
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner
-from training.stages import Results, Stages
-
-#: Hops of a pool that are simulated, and kept, together.
-BLOCK = 2048
-#: Random hops that the floor is measured on.
-FLOOR_HOPS = 64
-#: Packages whose versions are noted with scores.
-NOTED = ("torch", "stable-baselines3")
+from training.stages import Results
 
 
-class Comparison:
-    """One scene and landing; see ``varied`` for scenes that vary."""
+class Comparison(Question):
+    """All methods that answer it."""
 
     #: Settings of policies that differ from the usual ones.
     policy_settings: ClassVar[dict[str, Any]] = {}
     #: Planners that hops in turn begin from.
     starts: ClassVar[tuple[str, ...]] = tuple(REFINED)
-    hops: Any
 
     def __init__(self, config: CompareConfig) -> None:
-        self.config = config
         if config.bayes:
             require_botorch()
-        changes = {} if config.duration is None else {"duration": config.duration}
-        self.scenes = registered.scenes_of(config.scene, config.landing, **changes)
-        self.scene = self.scenes.base
-        self.hops = self._simulator()
-        self.stages = Stages(Path(config.out), say=print if config.progress else lambda _: None)
-        self.places = registered.read(
-            config.scene, config.landing, config.targets, registered.SECOND if config.second else registered.PATH
-        )
-        self.targets = np.concatenate(list(self.places.values()))
-        #: Which targets are of a place, shape (targets,).
-        self.rows = {p: np.repeat([p == q for q in self.places], [len(t) for t in self.places.values()]) for p in self.places}
-        #: What every stage's record depends on.
-        self.base = {"scene": asdict(self.scene), "fidelity": config.fidelity} | self._varying()
-        #: What the methods are judged by: kept scores, where there are some, and those of this run.
-        self.scores = Scores(self.task) if config.kept is None else Scores.read(config.kept, self.task)
+        super().__init__(config)
+        self._fitted: dict[tuple[int, int], Fitted] = {}
         if config.hyperparameters is not None or "ppo" in {algorithm for algorithm, _ in config.policies.values()}:
             from training.compare import policies
 
             policies.check(self)
-        self._fitted: dict[tuple[int, int], Fitted] = {}
-        self._pools: dict[int, HopData] = {}
-
-    def _simulator(self) -> Any:
-        return Hops(self.scene, check_fidelity(self.config.fidelity), self.config.threads)
-
-    @property
-    def reaches(self) -> np.ndarray:
-        """Reach of the scene of each target, shape (n,) [m]."""
-        return np.full(len(self.targets), reach(self.scene))
-
-    def _varying(self) -> dict[str, Any]:
-        """What records depend on where scenes vary."""
-        return {}
-
-    @property
-    def units(self) -> np.ndarray:
-        """What lengths are divided by in scores: metres, shape (n,) [m]."""
-        return np.ones(len(self.targets))
-
-    @property
-    def task(self) -> dict[str, Any]:
-        """What all scores have in common."""
-        counts = {place: len(targets) for place, targets in self.places.items()}
-        given = {"perturbations": self.config.perturbations, "places": counts, "targets": hash_of(self.targets.tolist())}
-        return self.base | given | {"model_version": MODEL_VERSION}
 
     def run(self) -> None:
         """All stages whose scores are not kept, cheap ones first."""
@@ -105,9 +50,9 @@ class Comparison:
         if not find_spec("cma"):
             self.stages.say("cma: not installed, so its rows and the oracle are left out; pip install 'tensegrity-gym[cma]'")
         if self.scores.floor is None:
-            self._floor()
+            self.measure_floor()
         for seed, budget in config.planner_runs:
-            if not self._is_kept(self._planner_settings(seed), seed, budget):
+            if not self.is_kept(self._planner_settings(seed), seed, budget):
                 self._planner_run(seed, budget)
         self._oracle()
         for seed, budget in config.policy_runs:
@@ -116,16 +61,9 @@ class Comparison:
         if config.latencies:
             latency.measure(self)
 
-    def _is_kept(self, settings: Mapping[str, Any], seed: int, budget: int) -> bool:
-        """Whether the kept scores have all these methods, with their settings."""
-        kept = all(self.scores.holds(method, budget, seed, hash_of(content)) for method, content in settings.items())
-        if kept:
-            self.stages.say(f"seed {seed} after {budget} calls: scores of {', '.join(settings)} kept")
-        return kept
-
     def _planner_run(self, seed: int, budget: int) -> None:
         """All planners of one seed and budget."""
-        self._floor()
+        self.measure_floor()
         self._planners(seed, budget)
         for method, (stage, make) in self.trying(seed).items():
             self._tried(method, stage, make, seed, budget)
@@ -162,59 +100,6 @@ class Comparison:
         plans = self.learning | self.planning
         return dict.fromkeys(self.names, plans) | {m: plans | self.trying_settings(m) for m in self.trying(seed)}
 
-    def pool(self, seed: int) -> HopData:
-        """The hops of a seed: as many as the largest budget; smaller budgets are its first rows."""
-        if seed in self._pools:
-            return self._pools[seed]
-        most = max(self.config.budgets)
-        if self.config.data is not None:
-            found = from_file(self.config.data, self.scenes, self.config.fidelity, seed, most)
-        else:
-            found = dataset.concatenate([self._block(seed, k, most) for k in range(0, most, BLOCK)])
-        self._pools = {seed: found}  # one at a time in memory
-        return found
-
-    def learnt(self, seed: int, budget: int) -> HopData:
-        """The hops that planners of a seed and budget learn from, with a record of which they are."""
-        pool, name = self.pool(seed), f"hops_{seed}_{budget}"
-        found = pool.rows(slice(0, budget))
-        if name not in self.stages.hashes:
-            seconds = pool.seconds * budget / len(pool)
-            self.stages.run(name, self.base | {"digest": found.digest}, lambda: {"seconds": seconds})
-        return found
-
-    def _block(self, seed: int, first: int, most: int) -> HopData:
-        last = min(first + BLOCK, most)
-        path = self.stages.folder / f"hops_{seed}_{first}_{last}.h5"
-
-        def work() -> Results:
-            part = simulated(self.hops, sample_stretches(last, seed)[first:last], seed)
-            dataset.write(path, part)
-            return {"seconds": part.seconds}
-
-        self.stages.run(path.stem, self.base | {"seed": seed, "first": first, "last": last}, work, files=[path.name])
-        found, made = dataset.read(path), model_of(self.config.fidelity, self.scene)
-        # older files name the paper's model whichever made them; the stage's record knows
-        configuration = found.configuration | {"fidelity": made.levers(), "precision": made.precision}
-        return HopData(found.columns, configuration, found.seconds)
-
-    def _floor(self) -> None:
-        if "floor" in self.stages.results:
-            return
-        found = self.stages.run("floor", self.base | {"perturbations": self.config.perturbations}, self._moved_hops)
-        moved = np.array(found["distances"]).mean(axis=1) / np.array(found.get("reaches", 1.0))
-        self.scores.floor = rounded(float(interquartile_mean(moved)))
-
-    def _moved_hops(self) -> Results:
-        """How far moved starts carry random hops [m]."""
-        landings = self.hops.perturbed(sample_stretches(FLOOR_HOPS, 99), self.config.perturbations)
-        return {"distances": np.linalg.norm(landings[:, 1:] - landings[:, :1], axis=2).tolist()}
-
-    @property
-    def floor(self) -> float:
-        """How far moved starts land from where the unmoved one does, root mean square in each direction [m]."""
-        return float(np.sqrt(np.mean(np.square(self.stages.results["floor"]["distances"])) / 2))
-
     def fitted(self, seed: int, budget: int) -> Fitted:
         """Planners of a seed and budget."""
         if (seed, budget) not in self._fitted:
@@ -248,7 +133,7 @@ class Comparison:
         for name, content in self._planner_settings(seed).items():
             if name in self.names:
                 answers = partial(self._planned, f"plans_{tag}", name)
-                self.score(name, seed, budget, f"plans_{tag}", answers, content, self._learnt_in(name, tag))
+                self.score(name, seed, budget, f"plans_{tag}", answers, How(content, self._learnt_in(name, tag)))
 
     @property
     def learning(self) -> dict[str, Any]:
@@ -288,9 +173,8 @@ class Comparison:
             return {"stretches": make(self.fitted(seed, budget)).predict(self.targets)[0].tolist()}
 
         self.stages.run(name, self.trying_settings(method), work, needs=[f"plans_{tag}"])
-        settings = self._planner_settings(seed)[method]
-        seconds = self._learnt_in(begins_from(method), tag)
-        self.score(method, seed, budget, name, lambda: self.stages.results[name], settings, seconds)
+        how = How(self._planner_settings(seed)[method], self._learnt_in(begins_from(method), tag))
+        self.score(method, seed, budget, name, lambda: self.stages.results[name], how)
 
     def _best(self, fitted: Any, tries: int) -> Planner:
         return BestOfPlanner(fitted.inverse, self.hops.land, tries)
@@ -306,7 +190,7 @@ class Comparison:
             return
         budget = max(self.config.budgets)
         settings = {"search": asdict(self._search), "images": True}
-        if self._is_kept({ORACLE: settings}, 0, budget):
+        if self.is_kept({ORACLE: settings}, 0, budget):
             return
         self.require_planners(0, budget)
 
@@ -317,7 +201,7 @@ class Comparison:
 
         self.stages.run(ORACLE, settings | {"targets": self.targets.tolist()}, work, needs=[f"net_0_{budget}"])
         calls = self.stages.results[ORACLE]["calls_per_answer"]
-        self.score(ORACLE, 0, budget, ORACLE, lambda: self.stages.results[ORACLE], settings, 0.0, calls)
+        self.score(ORACLE, 0, budget, ORACLE, lambda: self.stages.results[ORACLE], How(settings, 0.0, calls))
 
     def _search_from(self, start: Planner) -> Planner:
         """CMA-ES on the simulator."""
@@ -332,7 +216,7 @@ class Comparison:
         """Train a policy, and score it, unless its score is kept."""
         from training.compare import policies  # stable-baselines3 takes seconds to import
 
-        if not self._is_kept({method: policies.settings_of(self, method, 0, budget)}, seed, budget):
+        if not self.is_kept({method: policies.settings_of(self, method, 0, budget)}, seed, budget):
             policies.run(self, method, seed, budget)
 
     def require_policy(self, method: str, seed: int, budget: int) -> None:
@@ -341,44 +225,6 @@ class Comparison:
 
         if f"policy_{method}_{seed}_{budget}" not in self.stages.results:
             policies.run(self, method, seed, budget)
-
-    def score(
-        self,
-        method: str,
-        seed: int,
-        budget: int,
-        needs: str,
-        answers: Callable[[], Any],
-        settings: Mapping[str, Any],
-        seconds: float,
-        calls_per_answer: float | None = None,
-    ) -> None:
-        """Simulate the answers of a method, from their start and from moved ones, and take down how near they come."""
-
-        def work() -> Results:
-            stretches = np.array(answers()["stretches"])
-            landings = self.hops.perturbed(stretches, self.config.perturbations, self.targets)
-            return {"stretches": stretches.tolist(), "landings": landings.tolist()}
-
-        content = self.base | {"perturbations": self.config.perturbations, "targets": self.targets.tolist()}
-        name = f"score_{method}_{seed}_{budget}"
-        found = self.stages.run(name, content, work, needs=[needs])
-        landings = np.array(found["landings"], dtype=np.float64)[:, 1:]
-        errors, scatter = measure(landings, self.targets[:, :2], self.reaches, self.units, self.rows["inside"])
-        self.scores.add(
-            Score(
-                method,
-                budget,
-                seed,
-                errors,
-                scatter,
-                rounded(seconds),
-                hash_of(settings),
-                self.stages.dates[name][:10],
-                ", ".join(f"{name} {version}" for name, version in package_versions().items() if name in NOTED),
-                calls_per_answer,
-            )
-        )
 
 
 def comparison_of(config: CompareConfig) -> Comparison:

@@ -20,7 +20,8 @@ from surrogate.model import HopNet, one_thread
 from tensegrity_gym.task import check_fidelity, reach
 from tensegrity_gym.types import Floats
 from training.compare.config import CompareConfig
-from training.compare.run import BLOCK, FLOOR_HOPS, Comparison
+from training.compare.question import BLOCK, FLOOR_HOPS
+from training.compare.run import Comparison
 from training.evolution import EvolutionConfig
 from training.hops import VariedHops
 from training.inverse import InversePlanner, fit_energy
