@@ -214,7 +214,7 @@ def test_hops_of_scenes_that_vary_are_planned_in_the_one_asked_for(tmp_path: Pat
         with pytest.raises(InvalidParameterError, match=said):
             planner_of(net, card, data, at=at)
     alike = alike_data(data, scene_ranges(dict(VARYING.scene_ranges)))
-    net, card = train(alike, replace(QUICK, net=NetConfig(hidden=(32, 32), members=2), epochs=100), progress=False)
+    net, card = train(alike, replace(QUICK, net=NetConfig(hidden=(32, 32), members=2), epochs=300), progress=False)
     answers = varied_planner_of(net, card, alike, config=POOL).predict(seen)[0]  # asked in metres all the same
     assert np.linalg.norm(real(answers) * 4.0 / seen[:, 2:3] - seen[:, :2], axis=1).max() < 0.02
     with pytest.raises(DataFileError, match="expected lengths 'as on Earth'"):  # a net of the comparison, and a file in metres

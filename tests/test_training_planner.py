@@ -79,6 +79,28 @@ def test_a_target_that_doubt_keeps_it_away_from_is_not_called_unreachable() -> N
     assert plans.reachable.tolist() == [True, False]  # the first lies within the doubt of 0.08 m, the second beyond 0.18 m
 
 
+def test_it_leaves_a_stored_hop_as_far_as_pays() -> None:
+    """Doubt grows in proportion to the way from a stored hop, the tip of a cone that derivatives do not tell the way off.
+
+    With a linear map J and doubt c a unit of the way x, in each direction, |d - J x|^2 + 2 c^2 |x|^2 is least, by ridge
+    regression, at x = J' (J J' + 2 c^2)^-1 d. Errors within 5 % of the least count as equals (``InverseConfig.equal``).
+    """
+    slope, hop, doubt = np.array([[0.5, -0.3, 0.2, 0.1], [-0.1, 0.4, 0.3, -0.5]]), np.array([0.43, 0.52, 0.47, 0.55]), 0.4
+
+    def landing(stretches: Tensor) -> Tensor:
+        return (stretches.double() @ torch.from_numpy(slope.T)).float()[None]
+
+    def correction(stretches: Tensor) -> tuple[Tensor, Tensor]:
+        square = ((stretches.double() - torch.from_numpy(hop)) ** 2).sum(dim=-1)
+        return torch.zeros(*stretches.shape[:-1], 2), (doubt**2 * square).float()
+
+    apart = np.array([(0.004, 0.0), (0.0, 0.006), (-0.003, 0.004), (0.02, -0.01)])
+    best = np.linalg.solve(slope @ slope.T + 2 * doubt**2 * np.eye(2), apart.T).T @ slope
+    least = np.sqrt(((best @ slope.T - apart) ** 2).sum(axis=1) + 2 * doubt**2 * (best**2).sum(axis=1))
+    planner = InversePlanner(landing, correction=correction, stored=hop[None])
+    assert planner.plan(hop @ slope.T + apart).errors == pytest.approx(least, rel=0.05)
+
+
 def test_beyond_an_arms_length_it_points_at_the_target() -> None:
     directions = np.linspace(-0.6, 0.6, 7)
     targets = 1.3 * np.column_stack([np.cos(directions), np.sin(directions)])

@@ -16,6 +16,8 @@ from tensegrity_gym import STRETCH_RANGE
 from tensegrity_gym.errors import InvalidParameterError
 from training.planner import Images, Prediction, targets_of
 
+#: Longest first step in one stretch, from hops towards the target: what is farther away tells little of it [-].
+LONGEST_AIM = 0.05
 #: Added to the variance under the root, so that its derivative exists where it is zero [m^2].
 LEAST_VARIANCE = 1e-10
 #: Step of the differences that derivatives are taken by [-].
@@ -35,9 +37,11 @@ class InverseConfig:
 
     pool: int = 4096
     """Spread-out stretches that the starts are chosen from."""
-    starts: int = 6
+    aims: int = 64
+    """Points of the pool that a first step is taken from, straight to the target: the best ends of these are the starts."""
+    starts: int = 12
     """Descents per target."""
-    steps: int = 6
+    steps: int = 12
     """Steps per descent."""
     damping: float = 1e-4
     """Damping at the first step, as a share of the squared reach of the pool; it falls with every step that helps."""
@@ -48,7 +52,7 @@ class InverseConfig:
     """A target is called unreachable if the landing expected nearest to it is farther away than this [m], and than its doubt."""
 
     def __post_init__(self) -> None:
-        for name in ("pool", "starts", "steps"):
+        for name in ("pool", "aims", "starts", "steps"):
             if getattr(self, name) < 1:
                 raise InvalidParameterError(f"{name}: expected an integer >= 1, got {getattr(self, name)}")
 
@@ -70,6 +74,9 @@ class InversePlanner:
     target, a surface in the box, it takes those that it is surest of. Both are residuals of one least-squares problem,
     solved by Levenberg-Marquardt steps; stretches at the end of their range that would leave it are held there for the
     step, so that answers on the box's boundary are reached.
+
+    A stored hop is where doubt is least, the tip of a cone, which no descent leaves for a target beside it. So first a step is
+    taken from each of many hops and points of the pool that heeds the landing alone; descents begin where that ended best.
 
     Args:
         landing: stretches, shape (n, n_actuators), to landings as each member sees them, shape (members, n, 2) [m].
@@ -162,27 +169,33 @@ class InversePlanner:
     def _search(self, goal: Tensor, starts: int) -> tuple[Tensor, Tensor]:
         """Ends of the descents (n, starts, n_actuators) and their expected squares (n, starts) [m^2]."""
         mean, variance = self.pool_seen
-        first = (torch.cdist(goal, mean) ** 2 + variance).topk(min(starts, len(self.pool)), largest=False).indices
-        n, starts = first.shape
-        stretches, cost = self._descend(self.pool[first].reshape(n * starts, -1), goal.repeat_interleave(starts, dim=0))
+        aims = min(max(self.config.aims, starts), len(self.pool))
+        first = (torch.cdist(goal, mean) ** 2 + variance).topk(aims, largest=False).indices
+        found, cost = self._aim(self.pool[first].reshape(len(goal) * aims, -1), goal.repeat_interleave(aims, dim=0))
+        found = found.reshape(len(goal), aims, -1)
+        best = cost.reshape(len(goal), aims).topk(min(starts, aims), largest=False).indices
+        found = torch.gather(found, 1, best[..., None].expand(-1, -1, found.shape[2]))
+        n, starts, _ = found.shape
+        stretches, cost = self._descend(found.reshape(n * starts, -1), goal.repeat_interleave(starts, dim=0))
         return stretches.reshape(n, starts, -1), cost.reshape(n, starts)
 
+    def _aim(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """One step straight to the goal, whatever the doubt there, or none where that is worse; and the expected square."""
+        residual, slope = self._residual(start, goal)
+        damping = torch.full((len(start),), self.config.damping * self.scale)
+        step = _step(start, residual[:, :2], slope[:, :2], damping)
+        longest = step.abs().amax(dim=1, keepdim=True).clamp(min=LONGEST_AIM)
+        aimed = (start + step * (LONGEST_AIM / longest)).clamp(*STRETCH_RANGE)
+        cost, aimed_cost = (residual**2).sum(dim=1), self._cost(aimed, goal)
+        better = aimed_cost < cost
+        return torch.where(better[:, None], aimed, start), torch.where(better, aimed_cost, cost)
+
     def _descend(self, best: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        low, high = STRETCH_RANGE
         residual, slope = self._residual(best, goal)
         cost = (residual**2).sum(dim=1)
         damping = torch.full_like(cost, self.config.damping * self.scale)
-        eye = torch.eye(residual.shape[1])
         for _ in range(self.config.steps):
-            downhill = -(slope * residual[..., None]).sum(dim=1)  # (n, n_actuators)
-            held = ((best <= low) & (downhill < 0)) | ((best >= high) & (downhill > 0))
-            free = slope.masked_fill(held[:, None], 0.0)
-            # (J'J + d I)^-1 J' = J' (J J' + d I)^-1, and the latter is but 3 by 3
-            system = free @ free.mT + damping[:, None, None] * eye
-            solved, singular = torch.linalg.solve_ex(system, residual[..., None])
-            # both directions may run alike, and the damping have fallen below rounding: stay, and damp more
-            solved = solved.masked_fill(singular[:, None, None] != 0, 0.0)
-            tried = (best - (free.mT @ solved)[..., 0]).clamp(low, high)
+            tried = (best + _step(best, residual, slope, damping)).clamp(*STRETCH_RANGE)
             tried_residual, tried_slope = self._residual(tried, goal)
             tried_cost = (tried_residual**2).sum(dim=1)
             better = tried_cost < cost
@@ -191,6 +204,11 @@ class InversePlanner:
             slope = torch.where(better[:, None, None], tried_slope, slope)
             damping = torch.where(better, damping / 8, damping * 4)
         return best, cost
+
+    def _cost(self, stretches: Tensor, goal: Tensor) -> Tensor:
+        """Expected square of the landing error (n,) [m^2]."""
+        mean, variance = self.see(stretches)
+        return ((mean - goal) ** 2).sum(dim=1) + variance
 
     def _residual(self, stretches: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Landing minus goal and the root of the variance, (n, 3) [m], and their derivatives, (n, 3, n_actuators) [m]."""
@@ -217,6 +235,20 @@ class InversePlanner:
         least = error.min(dim=1, keepdim=True).values
         equals = error <= torch.maximum((1 + self.config.equal) * least, least + LEAST_EQUAL)
         return torch.where(equals, energies, torch.inf).argmin(dim=1)
+
+
+def _step(at: Tensor, residual: Tensor, slope: Tensor, damping: Tensor) -> Tensor:
+    """Damped Gauss-Newton steps (n, n_actuators) of k residuals (n, k) with slopes (n, k, n_actuators)."""
+    low, high = STRETCH_RANGE
+    downhill = -(slope * residual[..., None]).sum(dim=1)  # (n, n_actuators)
+    held = ((at <= low) & (downhill < 0)) | ((at >= high) & (downhill > 0))
+    free = slope.masked_fill(held[:, None], 0.0)
+    # (J'J + d I)^-1 J' = J' (J J' + d I)^-1, and the latter is but k by k
+    system = free @ free.mT + damping[:, None, None] * torch.eye(residual.shape[1])
+    solved, singular = torch.linalg.solve_ex(system, residual[..., None])
+    # both directions may run alike, and the damping have fallen below rounding: stay, and damp more
+    solved = solved.masked_fill(singular[:, None, None] != 0, 0.0)
+    return -(free.mT @ solved)[..., 0]
 
 
 def _in_range(stretches: Tensor) -> np.ndarray:
