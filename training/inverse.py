@@ -22,8 +22,8 @@ LONGEST_AIM = 0.05
 LEAST_VARIANCE = 1e-10
 #: Step of the differences that derivatives are taken by [-].
 DIFFERENCE = 1e-3
-#: Expected errors closer than this are the same [m].
-LEAST_EQUAL = 1e-4
+#: Expected errors closer than this are the same: a tenth of the floor of a touchdown on Earth [m].
+LEAST_EQUAL = 3e-5
 #: To add to the seed of the starts where hops may have been drawn with that seed: they are points of the same sequence, and
 #: starts already.
 START_SEED = 2_000_003

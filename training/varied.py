@@ -6,7 +6,6 @@ Lengths made alike (see ``similarity``) let what is learnt in one gravity serve 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,8 +27,6 @@ from training.similarity import alike
 
 #: Neighbours of each hop that tell how its landing changes with stretches and scene.
 NEIGHBOURS = 8
-#: Descents per target, at least: starts are chosen by the net alone, which tells less of them than kriging in one scene does.
-VARIED_STARTS = 32
 
 
 class VariedPlanner:
@@ -188,11 +185,10 @@ def inverse_planners(
     landing: FrozenLanding, kriging: VariedKriging | None, config: InverseConfig, **of_all: Any
 ) -> Callable[[Floats], InversePlanner]:
     """Scene values in observed order (k,) [SI] to the robust planner of that scene; ``of_all``: what all of them are told."""
-    settings = replace(config, starts=max(VARIED_STARTS, config.starts))
 
     @one_thread()
     def make(values: Floats) -> InversePlanner:
-        planner = InversePlanner(landing.at(values), settings, **of_all)
+        planner = InversePlanner(landing.at(values), config, **of_all)
         if kriging is not None:  # the descents need it; to see the whole pool with it in each scene would take a second
             planner.correction = kriging.at(values)
         return planner

@@ -21,6 +21,7 @@ from training.compare.learn import Fitted, fit_net
 from training.compare.methods import BAYESIAN, ORACLE, PLANNERS, REFINED, answer_calls, begins_from
 from training.compare.question import How, Question
 from training.evolution import EvolutionConfig, EvolutionPlanner
+from training.inverse import LEAST_EQUAL
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner
 from training.stages import Results
@@ -154,6 +155,7 @@ class Comparison(Question):
             "tandem": asdict(config.tandem),
             "search": config.search,
             "images": True,  # of stored hops, which planners did without before
+            "least_equal": LEAST_EQUAL,
         }
 
     def _planned(self, stage: str, name: str) -> Results:
