@@ -168,7 +168,7 @@ def test_a_comparison_that_asks_for_it_adds_it_and_keeps_all_else(tmp_path: Path
     before.run()
     asked = run.Comparison(replace(quick, bayes=2, bayes_seeds=1))
     asked.run()
-    added = {"bayes_0_16", "score_bayes2_0_16", "latency_bayes2"}
+    added = {"bayes_0_16", "score_bayes2_0_16", "latency_bayes2_16"}
     assert set(asked.stages.results) - set(asked.stages.skipped) == added
     assert set(asked.stages.skipped) == set(before.stages.results)
     outcome = Outcome(asked)

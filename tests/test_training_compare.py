@@ -27,7 +27,7 @@ from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.latency import question_times
 from training.compare.results import Outcome
-from training.compare.scores import measure
+from training.compare.scores import errors_and_scatter
 from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
 from training.hops import Hops, VariedHops, repeated
 from training.inverse import InversePlanner
@@ -159,7 +159,7 @@ def test_quick_comparison_tells_all_and_repeats_its_bits_after_a_loss(folder: Pa
 def test_records_of_policies_name_the_least_gradient_steps_only_where_these_bind(tmp_path: Path) -> None:
     comparison = run.Comparison(CompareConfig(out=tmp_path, progress=False))
     asked = [(algorithm, budget) for algorithm in ("sac", "td3", "ppo") for budget in (10_000, 40_000, 100_000)]
-    bound = {a for a in asked if "least_updates" in policies.settings_of(comparison, a[0], 0, a[1])}
+    bound = {a for a in asked if "least_updates" in policies.content_of(comparison, a[0], 0, a[1])}
     assert bound == {("sac", 100_000), ("td3", 100_000)}  # else all of fewer hops would be trained again
 
 
@@ -185,15 +185,15 @@ def test_scores_keep_errors_to_targets_and_scatter_about_the_answers_own_mean() 
         landings = np.array([3.0, 4.0]) + rng.normal(0, 1e-3, (5000, starts, 2))
         landings[1::2] += rng.normal(0, 1.0, (2500, starts, 2))  # of targets that are not inside
         inside = np.arange(5000) % 2 == 0
-        errors, scatter = measure(landings, targets, np.ones(5000), units, inside)
+        errors, scatter = errors_and_scatter(landings, targets, np.ones(5000), units, inside)
         assert errors[0] == pytest.approx(10.0, rel=1e-3)  # 5 m, in units of half a metre
         # mean length of a plane normal vector: sqrt(pi / 2) deviations; trimming skews the mean of two by some per cent
         assert scatter == pytest.approx(2e-3 * np.sqrt(np.pi / 2), rel=0.08 if starts == 2 else 0.02)
     landings[0, 3] = np.nan  # a failed hop counts as one that landed two reaches away, and tells nothing of scatter
-    with_failed, again = measure(landings, targets, np.ones(5000), units, inside)
+    with_failed, again = errors_and_scatter(landings, targets, np.ones(5000), units, inside)
     assert with_failed[0] == pytest.approx((63 * 10.0 + TARGET_LIMIT / 0.5) / 64, rel=1e-3)
     assert again == pytest.approx(scatter, rel=0.01)
-    assert np.isnan(measure(landings[:, :1], targets, np.ones(5000), units, inside)[1])
+    assert errors_and_scatter(landings[:, :1], targets, np.ones(5000), units, inside)[1] is None
 
 
 def test_more_seeds_keep_what_was_run(folder: Path) -> None:
@@ -253,13 +253,14 @@ def test_hops_that_are_no_calls_of_their_own_or_were_cut_off_are_not_learnt_from
 def test_what_plans_depend_on_is_in_their_record(folder: Path) -> None:
     """Another number of looks, or of descents, and they are made again, and timed again."""
     config = replace(CompareConfig(out=folder.parent, quick=True, progress=False).shortened(), algorithms=())
-    for changes in ({"search": 32}, {"inverse": replace(config.inverse, starts=3)}):
+    for changes, timed in (({"search": 32}, "cma"), ({"inverse": replace(config.inverse, starts=3)}, "single")):
         copy = folder.parent / f"changed_{next(iter(changes))}"
         shutil.copytree(folder, copy)
         again = run.Comparison(replace(config, out=copy, **changes))
         again.run()
         done = set(again.stages.results) - set(again.stages.skipped)
-        assert {"plans_0_16", "score_cma_0_16", "refine2_1_32", "latency"} <= done
+        assert {"plans_0_16", "score_cma_0_16", "refine2_1_32", f"latency_{timed}_32"} <= done
+        assert "latency_nearest_32" not in done
         assert not [name for name in done if name.startswith(("net", "hops", "floor"))]
 
 
@@ -335,9 +336,8 @@ def test_what_is_left_out_without_cma_is_said(tmp_path: Path, folder: Path, monk
     comparison.run()
     assert "pip install 'tensegrity-gym[cma]'" in said[0]
     assert not {"oracle", "score_cma_0_32", "score_oracle_0_32"} & set(comparison.stages.results)
-    # times of other planners are not kept for these; nor are there policies where they have no budget
-    assert "latency" not in comparison.stages.skipped
-    assert not {"cma", "sac"} & set(comparison.stages.results["latency"])
+    timed = {name for name in comparison.stages.results if name.startswith("latency_")}  # no policies where they have no budget
+    assert timed == {f"latency_{name}_32" for name in ("nearest", "single", "ensemble", "tandem", "best2", "repeat2", "refine2")}
 
 
 def test_every_method_is_timed_on_one_thread_and_often_enough() -> None:

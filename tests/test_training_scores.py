@@ -7,29 +7,31 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from training.compare import report, run
 from training.compare.config import CompareConfig
 from training.compare.results import Outcome
-from training.compare.scores import Latencies, Score, Scores, rounded
+from training.compare.scores import Latency, Line, Scores, rounded
 
 ROOT = Path(__file__).parent.parent
-TASK = {"fidelity": "flown", "ranges": {"gravity": (1.6, 9.81)}}
+TASK = {"fidelity": "flown", "scene": {"gravity": 9.8, "friction": 0.5}, "places": {"inside": 1, "beyond": 1}}
+KEPT = sorted((ROOT / "docs" / "scores").glob("*.jsonl"))
 
 
-def score(method: str = "sac", budget: int = 100, seed: int = 0, settings: str = "a") -> Score:
-    return Score(method, budget, seed, (0.1, 0.02), 1e-4, 1.5, settings, "2026-11-26", "torch 2.13.0")
+def line(method: str = "sac", budget: int = 100, seed: int = 0, settings: str = "a") -> Line:
+    return Line(method, budget, seed, (0.1, 0.02), 1e-4, 1.5, settings, "2026-11-26", "torch 2.13.0")
 
 
 def filled() -> Scores:
     scores = Scores(TASK)
     scores.floor = 3e-4
-    scores.latencies["latency"] = Latencies("b", {"sac": (1e-4, 2e-4)})
+    scores.latencies["sac"] = Latency("b", 100, 20, 1e-4, 2e-4, "2026-11-26")
     for seed in (2, 0, 10):
-        scores.add(score(seed=seed))
-    scores.add(replace(score("oracle", 1000), calls_per_answer=160.0))
+        scores.add(line(seed=seed))
+    scores.add(replace(line("oracle", 1000), calls_per_answer=160.0, scatter=None))
     return scores
 
 
@@ -40,21 +42,43 @@ def test_what_is_written_is_read_again_and_the_same_scores_give_the_same_text(tm
     again = Scores.read(path, TASK)
     assert vars(again) == vars(scores)
     assert [row.seed for row in again.of("sac", 100)] == [0, 2, 10]
-    again.write(tmp_path / "again.jsonl")
-    assert (tmp_path / "again.jsonl").read_bytes() == path.read_bytes()
-    assert Scores.read(tmp_path / "none.jsonl", TASK).rows == {}
+    assert path.read_text() == again.text() == scores.text()
+    assert again.digest == scores.digest
+    again.add(line(seed=3))
+    assert again.digest != scores.digest
+    assert Scores.read(tmp_path / "none.jsonl", TASK).lines == {}
 
 
 def test_scores_of_other_settings_are_of_another_method() -> None:
+    """At whichever budget: one curve must not be drawn through two methods."""
     scores = filled()
-    assert scores.holds("sac", 100, 2, "a")
-    assert not scores.holds("sac", 100, 2, "b")
-    assert not scores.holds("sac", 100, 3, "a")
-    scores.add(score(budget=1000, settings="b"))
-    assert len(scores.of("sac", 100)) == 3
-    scores.add(score(seed=0, settings="b"))
-    assert [row.settings for row in scores.of("sac", 100)] == ["b"]
-    assert len(scores.of("oracle", 1000)) == 1
+    scores.add(line(budget=1000))
+    assert scores.methods == ["sac", "oracle"]
+    scores.add(line(budget=1000, settings="b"))
+    assert list(scores.lines) == [("oracle", 1000, 0), ("sac", 1000, 0)]
+    assert scores.settings("sac") == "b"
+    assert scores.settings("td3") is None
+    assert scores.drop("sac") == 1
+    assert scores.methods == ["oracle"]
+
+
+def test_what_others_have_added_meanwhile_stays_and_what_is_stale_does_not_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "scores.jsonl"
+    filled().write(path)
+    mine, other = Scores.read(path, TASK), Scores.read(path, TASK)
+    other.add(line("td3"))
+    other.add(line(seed=1))
+    other.write(path)
+    mine.add(line(seed=4))
+    mine.write(path)
+    assert [row.seed for row in Scores.read(path, TASK).of("sac", 100)] == [0, 1, 2, 4, 10]
+    assert Scores.read(path, TASK).of("td3", 100)
+    stale = Scores.read(path, TASK)
+    stale.drop("sac")
+    stale.write(path)
+    assert Scores.read(path, TASK).methods == ["oracle", "td3"]
+    filled().write(path, anew=True)
+    assert Scores.read(path, TASK).lines == filled().lines
 
 
 def test_damaged_scores_and_those_of_another_task_are_named(tmp_path: Path) -> None:
@@ -63,8 +87,10 @@ def test_damaged_scores_and_those_of_another_task_are_named(tmp_path: Path) -> N
     whole = path.read_text()
     with pytest.raises(DataFileError, match=r"expected scores with fidelity 'paper', got 'flown'"):
         Scores.read(path, TASK | {"fidelity": "paper"})
+    with pytest.raises(DataFileError, match=r"expected scores with scene: friction 0.3, got 0.5; choose options that fit"):
+        Scores.read(path, TASK | {"scene": {"gravity": 9.8, "friction": 0.3}})
     lines = whole.splitlines()
-    head = json.loads(lines[0])
+    head, first = json.loads(lines[0]), json.loads(lines[1])
     damaged = {
         "cut": whole[:-30],
         "empty": "",
@@ -72,7 +98,11 @@ def test_damaged_scores_and_those_of_another_task_are_named(tmp_path: Path) -> N
         "format": json.dumps(head | {"format": 0}) + "\n",
         "head": lines[1],
         "row": lines[0] + '\n{"method": "sac"}\n',
-        "latencies": json.dumps(head | {"latencies": {"latency": 3}}) + "\n",
+        "latencies": json.dumps(head | {"latencies": {"sac": 3}}) + "\n",
+        "twice": whole + lines[-1] + "\n",
+        "mixed": whole + json.dumps(first | {"seed": 77, "settings": "b"}) + "\n",
+        "length": whole + json.dumps(first | {"seed": 77, "errors": [0.1]}) + "\n",
+        "words": whole + json.dumps(first | {"seed": 77, "scatter": "x"}) + "\n",
     }
     for text in damaged.values():
         path.write_text(text)
@@ -85,9 +115,9 @@ def test_digits_that_are_kept() -> None:
     assert rounded(2.0) == 2.0
 
 
-def small(out: Path, **changes: object) -> CompareConfig:
-    """A quick comparison that writes, of two planners' budgets and one policy's."""
-    quick = CompareConfig(out=out, quick=True, progress=False).shortened()
+def small(out: str, **changes: object) -> CompareConfig:
+    """A quick comparison that writes: planners of one seed and one budget, and one policy."""
+    quick = CompareConfig(out=Path(out), quick=True, progress=False).shortened()
     fewer = {"budgets": (16,), "seeds": (1,), "refine": (), "quick": False, "write": True} | changes
     return replace(quick, **fewer)  # type: ignore[arg-type]
 
@@ -96,57 +126,84 @@ def done(config: CompareConfig) -> set[str]:
     """Run a comparison; stages that were not found done."""
     comparison = run.comparison_of(config)
     comparison.run()
-    comparison.scores.write(config.kept_path)
+    comparison.scores.write(config.kept_path, anew=config.anew)
     return set(comparison.stages.results) - set(comparison.stages.skipped)
 
 
 def test_kept_scores_are_gone_on_from_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    run.main(small(Path("first")))
+    run.main(small("first"))
     kept, page = Path("docs/scores/earth_touchdown.jsonl"), Path("docs/results.md")
     assert kept.read_bytes() == Path("first/quick/scores.jsonl").read_bytes()
     told, text = kept.read_bytes(), page.read_bytes()
     assert len(list(Path("docs/images").glob("*.png"))) == 3
     # all is there: nothing is run, and the page is the same to the byte
-    run.main(small(Path("second")))
+    run.main(small("second"))
     assert not list(Path("second/quick/stages").glob("*.json"))
     assert (kept.read_bytes(), page.read_bytes()) == (told, text)
     # one more seed of the policies alone, then one of the planners, with what they need
-    assert done(small(Path("third"), policy_seeds=(2,))) == {"policy_sac_1_16", "score_sac_1_16"}
-    planners = done(small(Path("fourth"), seeds=(2,), policy_seeds=(1,)))
+    assert done(small("third", policy_seeds=(2,))) == {"policy_sac_1_16", "score_sac_1_16"}
+    planners = done(small("fourth", seeds=(2,), policy_seeds=(1,)))
     assert {"floor", "net_1_16", "score_ensemble_1_16", "score_best2_1_16"} <= planners
-    assert {name for name in planners if "_0_16" in name or "sac" in name} == {"hops_1_0_16"}  # seed 1's hops from number 0 on
-    both = Scores.read(kept, run.comparison_of(small(Path("fifth"))).task)
+    # seed 1's hops begin with number 0
+    assert {name for name in planners if "_0_16" in name or "sac" in name} == {"hops_1_0_16"}
+    both = Scores.read(kept, run.comparison_of(small("fifth")).task)
     assert [row.seed for row in both.of("sac", 16)] == [row.seed for row in both.of("ensemble", 16)] == [0, 1]
-    # times are measured again where there are others to measure, on the files that this takes
-    timed = done(small(Path("sixth"), refine=(2,), policy_budgets=()))
-    assert {"latency", "net_0_16", "score_refine2_0_16"} <= timed
+    # a method more is run and timed with what it takes, and the others are not
+    more = done(small("sixth", refine=(2,), policy_budgets=()))
+    assert {"net_0_16", "plans_0_16", "score_refine2_0_16", "score_repeat2_0_16", "latency_refine2_16"} <= more
+    assert not {"score_ensemble_0_16", "latency_ensemble_16", "oracle"} & more
+    # times of fewer hops do not replace those of more
+    timed = set(Scores.read(kept, both.task).latencies)
+    assert {"nearest", "ensemble", "best2", "refine2", "cma", "sac"} <= timed
+    assert not [name for name in done(small("seventh", budgets=(8,))) if name.startswith("latency")]
+    assert set(Scores.read(kept, both.task).latencies) == timed
     # another task is refused, unless all is to be anew
     with pytest.raises(DataFileError, match=r"expected scores with perturbations 3, got 2.*--anew"):
-        run.comparison_of(small(Path("seventh"), perturbations=3))
-    assert not run.comparison_of(small(Path("eighth"), perturbations=3, anew=True)).scores.rows
+        run.comparison_of(small("eighth", perturbations=3))
+    assert not run.comparison_of(small("eighth", perturbations=3, anew=True)).scores.lines
     with pytest.raises(InvalidParameterError, match="anew: expected it with --write"):
         CompareConfig(anew=True)
 
 
-def test_other_hyperparameters_replace_the_scores_of_all_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_settings_replace_what_they_make_stale_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    few = {"seeds": (1,), "policy_seeds": (2,), "latencies": 0, "oracle": 0, "tries": ()}
-    done(small(Path("first"), **few))
-    assert done(small(Path("second"), **few)) == set()
+    few = {"policy_seeds": (2,), "latencies": 0, "tries": ()}
+    done(small("first", **few))
+    assert done(small("second", **few)) == set()
+    committed = small("third", **few | {"policy_seeds": (1,)})
     folder = tmp_path / "hyperparameters"
     folder.mkdir()
-    committed = (ROOT / "training" / "hyperparameters" / "sac.toml").read_text()
-    (folder / "sac.toml").write_text(committed.replace("updates = 4 ", "updates = 3 "))
-    monkeypatch.setattr("training.algorithms.FOLDER", folder)
-    assert "policy_sac_0_16" in done(small(Path("third"), **few | {"policy_seeds": (1,)}))
-    scores = Scores.read(Path("docs/scores/earth_touchdown.jsonl"), run.comparison_of(small(Path("fourth"))).task)
+    text = (ROOT / "training" / "hyperparameters" / "sac.toml").read_text()
+    (folder / "sac.toml").write_text(text.replace("updates = 4 ", "updates = 3 "))
+    with monkeypatch.context() as patched:
+        patched.setattr("training.algorithms.FOLDER", folder)
+        assert done(committed) == {"policy_sac_0_16", "score_sac_0_16"}
+        scores = run.comparison_of(committed).scores
     assert [row.seed for row in scores.of("sac", 16)] == [0]
+    assert len(scores.of("ensemble", 16)) == 1
+    # and by what is no setting of a planner but changes its answers
+    for changes, stale in (
+        ({"search": 32}, {"score_cma_0_16"}),
+        ({"data": Path("hops.h5"), "algorithms": ()}, {"score_nearest_0_16", "score_oracle_0_16", "score_ensemble_0_16"}),
+    ):
+        comparison = run.comparison_of(replace(committed, out=Path("first/quick"), **changes))  # type: ignore[arg-type]
+        gone = {f"score_{method}_0_16" for method in scores.methods} - {
+            f"score_{method}_0_16" for method in comparison.scores.methods
+        }
+        assert stale <= gone
+    monkeypatch.setattr(run, "PLANNERS_VERSION", 999)
+    assert run.comparison_of(committed).scores.methods == []  # SAC's were of other hyper-parameters
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "docs" / "scores").glob("*.jsonl")), ids=lambda path: path.stem)
+def test_there_are_scores_of_the_table_that_readme_shows() -> None:
+    assert ROOT / "docs" / "scores" / "earth_touchdown.jsonl" in KEPT
+    assert "<!-- begin earth_touchdown -->" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", KEPT, ids=lambda path: path.stem)
 def test_documents_show_what_the_kept_scores_say(path: Path, tmp_path: Path) -> None:
-    """README's and docs' tables are those that the command would write, of today's physics and targets."""
+    """README's and docs' tables and figures are those that the command would make, of today's physics and targets."""
     scene, landing = path.stem.rsplit("_", 1)
     task = json.loads(path.read_text(encoding="utf-8").splitlines()[0])["task"]
     assert task["model_version"] == MODEL_VERSION
@@ -163,13 +220,13 @@ def test_documents_show_what_the_kept_scores_say(path: Path, tmp_path: Path) -> 
     comparison = run.comparison_of(config)
     comparison.scores = Scores.read(path, comparison.task)
     outcome = Outcome(comparison)
-    page = tmp_path / "page.md"
-    page.write_text((ROOT / "docs" / "results.md").read_text(encoding="utf-8"), encoding="utf-8")
-    readme = tmp_path / "README.md"
-    readme.write_text((ROOT / "README.md").read_text(encoding="utf-8"), encoding="utf-8")
-    before = page.read_bytes(), readme.read_bytes()
-    report.replace_between(page, path.stem, report.section(outcome, "images"), append=True)
-    report.replace_between(readme, path.stem, report.short(outcome))
-    assert (page.read_bytes(), readme.read_bytes()) == before
+    for name, text in (("docs/results.md", report.section(outcome, "images")), ("README.md", report.short(outcome))):
+        if name == "README.md" and path.stem != "earth_touchdown":
+            continue  # the only table that README has
+        copy = tmp_path / Path(name).name
+        copy.write_bytes((ROOT / name).read_bytes())
+        assert report.replace_between(copy, path.stem, text)
+        assert copy.read_bytes() == (ROOT / name).read_bytes()
     for kind in ("calls", "profile", "pareto"):
-        assert (ROOT / "docs" / "images" / f"results_{path.stem}_{kind}.png").is_file()
+        with Image.open(ROOT / "docs" / "images" / f"results_{path.stem}_{kind}.png") as picture:
+            assert picture.info["Source"] == comparison.scores.digest

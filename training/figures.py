@@ -29,10 +29,10 @@ def _style() -> AbstractContextManager[None]:
     return plt.rc_context(STYLE)  # type: ignore[arg-type]
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG atomically and close the figure."""
+def save(figure: Figure, path: Path, made_of: str | None = None) -> Path:
+    """Write a PNG atomically and close the figure; ``made_of`` tells, in its text "Source", what it shows."""
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight")
+    figure.savefig(picture, format="png", bbox_inches="tight", metadata=None if made_of is None else {"Source": made_of})
     plt.close(figure)
     with atomic_path(path) as temporary:
         temporary.write_bytes(picture.getvalue())

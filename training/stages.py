@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from surrogate.storage import ensure_folder, hash_of, read_json, write_json, writer_lock
+from surrogate.storage import ensure_folder, hash_of, package_versions, read_json, write_json, writer_lock
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.errors import DataFileError
 
@@ -31,6 +31,8 @@ class Stages:
         self.hashes: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
         self.dates: dict[str, str] = {}
+        #: Of packages, when a stage was run.
+        self.versions: dict[str, dict[str, str]] = {}
         self.results: dict[str, Results] = {}
         self.skipped: list[str] = []
 
@@ -60,11 +62,13 @@ class Stages:
                 seconds = results.get("seconds", time.perf_counter() - started)
                 date = datetime.now(UTC).isoformat(timespec="seconds")
                 record = {"hash": wanted, **content, "seconds": seconds, "date": date, "results": results}
+                record["versions"] = package_versions()
                 record["results_hash"] = _results_hash(record)
                 write_json(path, record)
             self.say(f"{name}: {seconds:.1f} s")
         self.hashes[name] = wanted
         self.seconds[name], self.dates[name] = float(record["seconds"]), record["date"]
+        self.versions[name] = record.get("versions", {})
         self.results[name] = record["results"]
         return self.results[name]
 

@@ -31,7 +31,7 @@ from training.symmetry import Symmetry
 
 #: Added to the seed of the envs that a policy is evaluated in while it trains.
 EVALUATION_SEED = 2_000_003
-#: Largest seed of a policy: numpy's takes 32 bits, and envs add their number and EVALUATION_SEED to it.
+#: Largest seed of a policy: numpy's takes 32 bits, and evaluation adds EVALUATION_SEED to it.
 MOST_SEED = 2**31
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from surrogate.model import NetConfig
 from surrogate.train import TrainConfig
 from tensegrity_gym.errors import InvalidParameterError
+from training.compare.methods import SYMMETRIC
 from training.compare.targets import SCENES, VARIED
 from training.inverse import InverseConfig
 from training.tandem import TandemConfig
@@ -115,7 +116,7 @@ class CompareConfig:
             raise InvalidParameterError(f"budgets: expected numbers >= 8, got {self.budgets}")
         each = {"seeds": (self.seeds, self.budgets), "policy_seeds": (self.seeds_of_policies, self.budgets_of_policies)}
         for name, (numbers, budgets) in each.items():
-            if len(numbers) not in (1, len(budgets)):
+            if budgets and len(numbers) not in (1, len(budgets)):
                 raise InvalidParameterError(f"{name}: expected one number, or one for each of {budgets}, got {numbers}")
         if self.bayes and self.scene in VARIED:
             raise InvalidParameterError(
@@ -201,9 +202,9 @@ class CompareConfig:
         return self.seeds if self.policy_seeds is None else self.policy_seeds
 
     @property
-    def policies(self) -> dict[str, tuple[str, bool]]:
-        """Policies by the names of their methods: the algorithm, and whether it knows the symmetries."""
-        return {a: (a, False) for a in self.algorithms} | {f"{a}_symmetric": (a, True) for a in self.symmetric}
+    def policies(self) -> list[str]:
+        """Names of the policies' methods."""
+        return [*self.algorithms, *(f"{algorithm}{SYMMETRIC}" for algorithm in self.symmetric)]
 
     @property
     def planner_runs(self) -> list[tuple[int, int]]:

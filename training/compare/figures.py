@@ -33,7 +33,8 @@ def _look(k: int) -> dict[str, object]:
 def _levels(axes: Axes, outcome: Outcome, along: str = "y") -> None:
     draw = axes.axhline if along == "y" else axes.axvline
     draw(outcome.factor * outcome.floor, color="#888888", ls=":", label="floor: start moved by 10 µm")
-    draw(outcome.factor * outcome.scatter, color="#888888", ls=(0, (1, 4)), label="scatter of the best answers")
+    if outcome.scatter is not None:
+        draw(outcome.factor * outcome.scatter, color="#888888", ls=(0, (1, 4)), label="scatter of the best answers")
     if outcome.oracle_error is not None:
         draw(outcome.factor * outcome.oracle_error, color="#888888", ls="--", label="CMA-ES on the simulator")
 
@@ -53,7 +54,7 @@ def sample_efficiency(outcome: Outcome, path: Path) -> Path:
         axes.set(xscale="log", yscale="log", xlabel="simulator calls learnt from", ylabel=f"landing error, IQM [{outcome.shown}]")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        return save(figure, path)
+        return save(figure, path, outcome.all.digest)
 
 
 def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
@@ -71,7 +72,7 @@ def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
         )
         axes.xaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        return save(figure, path)
+        return save(figure, path, outcome.all.digest)
 
 
 def pareto(outcome: Outcome, path: Path) -> Path:
@@ -94,4 +95,4 @@ def pareto(outcome: Outcome, path: Path) -> Path:
         )
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        return save(figure, path)
+        return save(figure, path, outcome.all.digest)

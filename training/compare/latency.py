@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,8 @@ import numpy as np
 from surrogate.model import one_thread
 from surrogate.storage import hash_of
 from tensegrity_gym.types import Floats
-from training.compare.methods import BAYESIAN, SIMULATING
-from training.compare.scores import Latencies, rounded
+from training.compare.methods import SIMULATING
+from training.compare.scores import Latency, rounded
 from training.planner import Planner
 from training.policies import ActorPolicy
 from training.stages import Results
@@ -26,53 +26,38 @@ SEED = 5
 
 
 def measure(comparison: Comparison) -> None:
-    """Time every method of the first seed and the largest budgets."""
-    config = comparison.config
-    trying = comparison.trying(0)
+    """Time every method of the first seed and the largest budgets, unless that is kept, or times of a larger budget are."""
+    config, budget = comparison.config, max(comparison.config.budgets)
     makers: dict[str, Callable[[Any], Planner]] = {name: itemgetter(name) for name in comparison.names}
-    makers |= {method: make for method, (stage, make) in trying.items() if stage != BAYESIAN}
+    makers |= {method: make for method, (_, make) in comparison.trying(0).items()}
+    for method, make in makers.items():
+        _time(comparison, method, budget, lambda make=make: make(comparison.fitted(0, budget)))  # type: ignore[misc]
     largest = max(config.budgets_of_policies, default=0)
-    policies = dict.fromkeys(config.policies, largest) if largest else {}
-    # threads: of torch; times from before, with all, are measured again
-    how = {"threads": 1, "planners": comparison.names, "targets": comparison.places["inside"].tolist()}
-    content = {"questions": config.latencies, "tries": config.tries, "refine": config.refine} | comparison.planning
-    _time(comparison, "latency", content | how, makers, policies)
-    for method, (stage, make) in trying.items():
-        if stage == BAYESIAN:  # apart, so that the others' times stay as they were
-            content = {"questions": config.latencies} | comparison.trying_settings(method)
-            _time(comparison, f"latency_{method}", content | how, {method: make}, {})
+    for method in config.policies if largest else ():
+        path = comparison.stages.folder / f"policy_{method}_0_{largest}.safetensors"
+        _time(comparison, method, largest, lambda path=path: ActorPolicy.load(path))  # type: ignore[misc]
 
 
-def _time(
-    comparison: Comparison,
-    name: str,
-    content: Mapping[str, Any],
-    makers: Mapping[str, Callable[[Any], Planner]],
-    policies: Mapping[str, int],
-) -> None:
-    """Time planners, made of what was fitted, and policies of so many calls, unless kept scores have times of the same."""
-    budget, targets = max(comparison.config.budgets), comparison.places["inside"]
-    trained = {method: f"policy_{method}_0_{calls}" for method, calls in policies.items()}
-    needs = [f"net_0_{budget}", *trained.values()]
-    settings = hash_of({**content, **comparison.learning, "needs": needs, "methods": sorted(makers)})
-    known = comparison.scores.latencies.get(name)
-    if known is not None and known.settings == settings:
+def settings_of(comparison: Comparison, method: str) -> str:
+    """Hash of all that a method's latency depends on besides its budget and how many questions are asked."""
+    return hash_of({"method": comparison.settings_of(method), "targets": comparison.places["inside"].tolist()})
+
+
+def _time(comparison: Comparison, method: str, budget: int, planner: Callable[[], Planner]) -> None:
+    questions, known = comparison.config.latencies, comparison.scores.latencies.get(method)
+    if known is not None and known.budget >= budget and known.questions >= questions:
         return
-    comparison.require_planners(0, budget)
-    for method, calls in policies.items():
-        comparison.require_policy(method, 0, calls)
+    settings = settings_of(comparison, method)
+    needs = comparison.require(method, 0, budget)
 
     def work() -> Results:
-        fitted, folder = comparison.fitted(0, budget), comparison.stages.folder
-        asked = {method: make(fitted) for method, make in makers.items()}
-        asked |= {method: ActorPolicy.load(folder / f"{file}.safetensors") for method, file in trained.items()}
-        return {
-            method: question_times(planner, method, targets, comparison.config.latencies) for method, planner in asked.items()
-        }
+        times = question_times(planner(), method, comparison.places["inside"], questions)
+        return {"median": float(np.median(times)), "p99": float(np.quantile(times, 0.99))}
 
-    found = comparison.stages.run(name, dict(content), work, needs=needs)
-    times = {m: (rounded(float(np.median(t))), rounded(float(np.quantile(t, 0.99)))) for m, t in found.items()}
-    comparison.scores.latencies[name] = Latencies(settings, times)
+    name = f"latency_{method}_{budget}"
+    found = comparison.stages.run(name, {"settings": settings, "questions": questions}, work, needs=[needs])
+    median, p99, day = rounded(found["median"]), rounded(found["p99"]), comparison.stages.dates[name][:10]
+    comparison.scores.latencies[method] = Latency(settings, budget, questions, median, p99, day)
 
 
 def question_times(planner: Planner, name: str, targets: Floats, questions: int) -> list[float]:

@@ -28,7 +28,7 @@ from tensegrity_gym.scene_ranges import SceneRanges
 from training.compare.config import CompareConfig
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.hops import Hops
-from training.inverse import InversePlanner, fit_energy
+from training.inverse import START_SEED, InversePlanner, fit_energy
 from training.planner import NearestHopPlanner, Planner
 from training.tandem import TandemPlanner
 
@@ -122,6 +122,7 @@ class Fitted:
                     self.config.inverse,
                     stored=self.data["stretches"],
                     images=self.net.landing_images,
+                    seed=self.seed + START_SEED,
                 ),
                 "ensemble": lambda: self.inverse,
                 "tandem": self._tandem,
@@ -142,7 +143,7 @@ class Fitted:
             energy=fit_energy(stretches, self.data["stored_energy"]),
             stored=stretches,
             images=self.net.landing_images,
-            seed=self.seed,
+            seed=self.seed + START_SEED,
         )
 
     def _tandem(self) -> TandemPlanner:

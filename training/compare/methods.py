@@ -12,6 +12,10 @@ REFINED = {"nearest": "repeat", "ensemble": "refine"}
 SIMULATING = {"best": "ensemble", "repeat": "nearest", "refine": "ensemble", "bayes": "ensemble"}
 #: The one of them whose stages are not called as it is.
 BAYESIAN = "bayes"
+#: How the names of policies end that know the symmetries; before it stands the algorithm's.
+SYMMETRIC = "_symmetric"
+#: To raise with whatever changes answers of a planner and is no setting of it: scores made before are not kept then.
+PLANNERS_VERSION = 2
 #: CMA-ES on the simulator: what can be had, at a price.
 ORACLE = "oracle"
 
@@ -51,6 +55,11 @@ def answer_calls(method: str) -> int:
 def begins_from(method: str) -> str:
     """The planner whose answers a method begins from, itself where it begins from none."""
     return next((start for prefix, start in SIMULATING.items() if method.startswith(prefix)), method)
+
+
+def algorithm_of(method: str) -> tuple[str, bool]:
+    """The algorithm of a policy, and whether it knows the symmetries."""
+    return method.removesuffix(SYMMETRIC), method.endswith(SYMMETRIC)
 
 
 def place(method: str) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.storage import CARD, POLICY_STATE, beside
 from training.algorithms import LEAST_UPDATES, hyperparameters, is_cap_passed
+from training.compare.methods import algorithm_of
 from training.compare.question import How
 from training.policies import ActorPolicy
 from training.sb3_vec_env import ENV_SEEDS
@@ -26,8 +27,7 @@ def check(comparison: Comparison) -> None:
 
 def config_of(comparison: Comparison, method: str, seed: int, budget: int) -> PolicyConfig:
     """How a policy is trained."""
-    config = comparison.config
-    algorithm, symmetric = config.policies[method]
+    config, (algorithm, symmetric) = comparison.config, algorithm_of(method)
     return PolicyConfig(
         algorithm,
         calls=budget,
@@ -39,7 +39,7 @@ def config_of(comparison: Comparison, method: str, seed: int, budget: int) -> Po
     )
 
 
-def settings_of(comparison: Comparison, method: str, seed: int, budget: int) -> dict[str, Any]:
+def content_of(comparison: Comparison, method: str, seed: int, budget: int) -> dict[str, Any]:
     """All that a policy depends on."""
     config = config_of(comparison, method, seed, budget)
     values = hyperparameters(config.algorithm, config.hyperparameters)
@@ -50,8 +50,15 @@ def settings_of(comparison: Comparison, method: str, seed: int, budget: int) -> 
     return content
 
 
-def run(comparison: Comparison, method: str, seed: int, budget: int) -> None:
-    """Train a policy, and score it."""
+def settings_of(comparison: Comparison, method: str) -> dict[str, Any]:
+    """All that policies of a method depend on besides budget and seed."""
+    content = content_of(comparison, method, 0, 1)
+    told = {name: value for name, value in content["config"].items() if name not in ("calls", "seed")}
+    return content | {"config": told, "least_updates": LEAST_UPDATES}
+
+
+def train(comparison: Comparison, method: str, seed: int, budget: int) -> str:
+    """Train a policy; returns its stage."""
     stages, config = comparison.stages, comparison.config
     name = f"policy_{method}_{seed}_{budget}"
     path = stages.folder / f"{name}.safetensors"
@@ -64,10 +71,19 @@ def run(comparison: Comparison, method: str, seed: int, budget: int) -> None:
         simulating, values = card["simulating_seconds"], card["train"]["hyperparameters"]
         return {"seconds": card["seconds"], "simulating": simulating, "values": values}
 
+    if name not in stages.results:
+        files = [path.name, beside(path, CARD).name]
+        stages.run(name, content_of(comparison, method, seed, budget), work, files=files)
+    return name
+
+
+def run(comparison: Comparison, method: str, seed: int, budget: int) -> None:
+    """Train a policy, and score it."""
+    name = train(comparison, method, seed, budget)
+    path, found = comparison.stages.folder / f"{name}.safetensors", comparison.stages.results[name]
+
     def answers() -> Results:
         return {"stretches": ActorPolicy.load(path).predict(comparison.targets)[0]}
 
-    files = [path.name, beside(path, CARD).name]
-    found = stages.run(name, settings_of(comparison, method, seed, budget), work, files=files)
-    how = How(settings_of(comparison, method, 0, budget), found["seconds"] - found["simulating"])
+    how = How(comparison.settings_of(method), found["seconds"] - found["simulating"])
     comparison.score(method, seed, budget, name, answers, how)

@@ -14,12 +14,14 @@ from surrogate.dataset import HopData
 from surrogate.generate import sample_stretches
 from surrogate.storage import hash_of, package_versions
 from tensegrity_gym import MODEL_VERSION
+from tensegrity_gym.specimen import POSITION
 from tensegrity_gym.task import check_fidelity, reach
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.learn import from_file, model_of, simulated
-from training.compare.scores import Score, Scores, measure, rounded
+from training.compare.scores import Line, Scores, errors_and_scatter, rounded
 from training.compare.statistics import interquartile_mean
+from training.hops import SEED as MOVED_SEED
 from training.hops import Hops
 from training.stages import Results, Stages
 
@@ -28,14 +30,14 @@ BLOCK = 2048
 #: Random hops that the floor is measured on.
 FLOOR_HOPS = 64
 #: Packages whose versions are noted with scores.
-NOTED = ("torch", "stable-baselines3")
+NOTED = ("numpy", "numba", "torch", "stable-baselines3")
 
 
 @dataclass(frozen=True)
 class How:
     """How a method came to its answers."""
 
-    settings: Mapping[str, Any]  #: all that it depends on besides budget and seed
+    settings: Mapping[str, Any]  #: all that scores depend on besides budget and seed
     seconds: float  #: wall time that it learnt for, simulating left out [s]
     calls_per_answer: float | None = None  #: hops for each answer, where they were counted
 
@@ -86,14 +88,8 @@ class Question:
         """What all scores have in common."""
         counts = {place: len(targets) for place, targets in self.places.items()}
         given = {"perturbations": self.config.perturbations, "places": counts, "targets": hash_of(self.targets.tolist())}
-        return self.base | given | {"model_version": MODEL_VERSION}
-
-    def is_kept(self, settings: Mapping[str, Any], seed: int, budget: int) -> bool:
-        """Whether the kept scores have all these methods, with their settings."""
-        kept = all(self.scores.holds(method, budget, seed, hash_of(content)) for method, content in settings.items())
-        if kept:
-            self.stages.say(f"seed {seed} after {budget} calls: scores of {', '.join(settings)} kept")
-        return kept
+        moved = {"moved_by": POSITION, "moved_seed": MOVED_SEED, "floor_hops": FLOOR_HOPS}
+        return self.base | given | moved | {"model_version": MODEL_VERSION}
 
     def pool(self, seed: int) -> HopData:
         """The hops of a seed: as many as the largest budget; smaller budgets are its first rows."""
@@ -169,9 +165,10 @@ class Question:
         name = f"score_{method}_{seed}_{budget}"
         found = self.stages.run(name, content, work, needs=[needs])
         landings = np.array(found["landings"], dtype=np.float64)[:, 1:]
-        errors, scatter = measure(landings, self.targets[:, :2], self.reaches, self.units, self.rows["inside"])
+        errors, scatter = errors_and_scatter(landings, self.targets[:, :2], self.reaches, self.units, self.rows["inside"])
+        versions = self.stages.versions[needs] or package_versions()
         self.scores.add(
-            Score(
+            Line(
                 method,
                 budget,
                 seed,
@@ -180,7 +177,7 @@ class Question:
                 rounded(how.seconds),
                 hash_of(how.settings),
                 self.stages.dates[name][:10],
-                ", ".join(f"{package} {version}" for package, version in package_versions().items() if package in NOTED),
+                ", ".join(f"{package} {versions[package]}" for package in NOTED if package in versions),
                 how.calls_per_answer,
             )
         )

@@ -68,12 +68,14 @@ def caption(outcome: Outcome) -> str:
     if outcome.oracle is not None and outcome.oracle_error is not None:
         calls = outcome.oracle.calls_per_answer
         oracle = f" CMA-ES on the simulator, {calls:.0f} hops an answer, comes to {_shown(outcome, outcome.oracle_error)}."
+    scatter = ""
+    if outcome.scatter is not None:
+        scatter = f"; the best answers' landings lie {_shown(outcome, outcome.scatter)} from their own mean"
     text = (
         f"Interquartile mean landing error over {len(outcome.comparison.places['inside'])} {which}targets inside the reachable "
         f"region and training seeds, after so many simulator calls learnt from; {config.perturbations} starts an answer, moved "
         f"by 10 µm. Brackets: 95 % interval over seeds; parentheses, where seeds are fewer than {FEWEST_SEEDS}: their range. The "
-        f"floor, how far moving its start carries a random hop's landing, is {_shown(outcome, outcome.floor)}; the best answers' "
-        f"landings lie {_shown(outcome, outcome.scatter)} from their own mean.{oracle} "
+        f"floor, how far moving its start carries a random hop's landing, is {_shown(outcome, outcome.floor)}{scatter}.{oracle} "
         f"Run {'on ' + first if first == last else f'from {first} to {last}'}."
     )
     return textwrap.fill(text, 128)

@@ -11,7 +11,7 @@ from tensegrity_gym.task import SUCCESS_RADIUS
 from tensegrity_gym.types import Floats
 from training.compare.methods import ORACLE, place
 from training.compare.run import Comparison
-from training.compare.scores import Score
+from training.compare.scores import Line
 from training.compare.statistics import interquartile_mean, interval, probability_of_improvement
 
 
@@ -35,7 +35,7 @@ class Outcome:
 
     def __init__(self, comparison: Comparison) -> None:
         self.comparison = comparison
-        self.kept = comparison.scores
+        self.all = comparison.scores
         self.varied = bool(comparison.scenes.ranges)
         #: Reach of each target's scene [m], and what errors are divided by, shapes (targets,).
         self.reaches, self.unit = comparison.reaches, comparison.units
@@ -44,10 +44,10 @@ class Outcome:
         self.rows = comparison.rows
 
     @cached_property
-    def scores(self) -> dict[tuple[str, int], list[Score]]:
+    def scores(self) -> dict[tuple[str, int], list[Line]]:
         """Scores of all seeds, by method and budget, methods in the order of tables."""
-        cells = sorted({key[:2] for key in self.kept.rows}, key=lambda cell: (place(cell[0]), cell[1]))
-        return {cell: self.kept.of(*cell) for cell in cells}
+        cells = sorted({key[:2] for key in self.all.lines}, key=lambda cell: (place(cell[0]), cell[1]))
+        return {cell: self.all.of(*cell) for cell in cells}
 
     @property
     def methods(self) -> list[str]:
@@ -83,33 +83,33 @@ class Outcome:
     @property
     def floor(self) -> float:
         """How far moved starts land from where the unmoved one does, interquartile mean over random hops."""
-        return float("nan") if self.kept.floor is None else self.kept.floor
+        return float("nan") if self.all.floor is None else self.all.floor
 
     @property
-    def scatter(self) -> float:
+    def scatter(self) -> float | None:
         """How far landings of the best answers lie from their own mean when the start is moved: no aim does better.
 
-        Mean over the seeds of the method that errs least of those that were run.
+        Mean over the seeds of the method that errs least of those that were run; None where one start was simulated alone.
         """
         best = min(self.scores, key=lambda cell: float(interquartile_mean(self.errors(*cell))))
-        return float(np.mean([score.scatter for score in self.scores[best]]))
+        known = [line.scatter for line in self.scores[best] if line.scatter is not None]
+        return float(np.mean(known)) if known else None
 
     @property
     def dates(self) -> tuple[str, str]:
         """Days of the first and of the last score."""
-        days = sorted(row.date for row in self.kept.rows.values())
+        days = sorted(row.date for row in self.all.lines.values())
         return days[0], days[-1]
 
     @property
     def versions(self) -> list[str]:
         """Versions of packages that scores were made with."""
-        return sorted({row.versions for row in self.kept.rows.values()})
+        return sorted({row.versions for row in self.all.lines.values()})
 
     @property
-    def oracle(self) -> Score | None:
+    def oracle(self) -> Line | None:
         """The score of CMA-ES on the simulator, None where it was not run."""
-        found = [rows[-1] for (method, _), rows in self.scores.items() if method == ORACLE]
-        return found[-1] if found else None
+        return next((lines[0] for (method, _), lines in self.scores.items() if method == ORACLE), None)
 
     @property
     def oracle_error(self) -> float | None:
@@ -126,4 +126,5 @@ class Outcome:
 
     def latency(self, method: str) -> tuple[float, float] | None:
         """Median and 99th percentile of a single question's wall time [s]."""
-        return next((found.times[method] for found in self.kept.latencies.values() if method in found.times), None)
+        found = self.all.latencies.get(method)
+        return None if found is None else (found.median, found.p99)

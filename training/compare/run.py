@@ -12,16 +12,15 @@ from typing import Any, ClassVar
 from surrogate import model
 from surrogate.dataset import HopData
 from surrogate.model import HopNet
-from surrogate.storage import CARD, beside
+from surrogate.storage import CARD, beside, hash_of
 from training.bayesian import BayesianConfig, BayesianPlanner, require_botorch
 from training.compare import latency
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.learn import Fitted, fit_net
-from training.compare.methods import BAYESIAN, ORACLE, PLANNERS, REFINED, answer_calls, begins_from
+from training.compare.methods import BAYESIAN, ORACLE, PLANNERS, PLANNERS_VERSION, REFINED, answer_calls, begins_from
 from training.compare.question import How, Question
 from training.evolution import EvolutionConfig, EvolutionPlanner
-from training.inverse import LEAST_EQUAL
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner
 from training.stages import Results
@@ -40,21 +39,32 @@ class Comparison(Question):
             require_botorch()
         super().__init__(config)
         self._fitted: dict[tuple[int, int], Fitted] = {}
-        if config.hyperparameters is not None or "ppo" in {algorithm for algorithm, _ in config.policies.values()}:
+        if config.hyperparameters is not None or any(method.startswith("ppo") for method in config.policies):
             from training.compare import policies
 
             policies.check(self)
+        self._leave_out_stale()
+
+    def _leave_out_stale(self) -> None:
+        """Of the kept scores, take only those that were made with today's settings."""
+        for method in self.scores.methods:
+            if self.scores.settings(method) != hash_of(self.settings_of(method)):
+                gone = self.scores.drop(method)
+                self.stages.say(f"{method}: {gone} kept scores were made with other settings, left out")
+        for method, found in list(self.scores.latencies.items()):
+            if found.settings != latency.settings_of(self, method):
+                del self.scores.latencies[method]
+                self.stages.say(f"{method}: its kept latency was measured with other settings, left out")
 
     def run(self) -> None:
         """All stages whose scores are not kept, cheap ones first."""
         config = self.config
         if not find_spec("cma"):
-            self.stages.say("cma: not installed, so its rows and the oracle are left out; pip install 'tensegrity-gym[cma]'")
+            self.stages.say("cma: not installed, so nothing of it is run; pip install 'tensegrity-gym[cma]'")
         if self.scores.floor is None:
             self.measure_floor()
         for seed, budget in config.planner_runs:
-            if not self.is_kept(self._planner_settings(seed), seed, budget):
-                self._planner_run(seed, budget)
+            self._planner_run(seed, budget)
         self._oracle()
         for seed, budget in config.policy_runs:
             for method in config.policies:
@@ -62,17 +72,51 @@ class Comparison(Question):
         if config.latencies:
             latency.measure(self)
 
-    def _planner_run(self, seed: int, budget: int) -> None:
-        """All planners of one seed and budget."""
-        self.measure_floor()
-        self._planners(seed, budget)
-        for method, (stage, make) in self.trying(seed).items():
-            self._tried(method, stage, make, seed, budget)
+    def _lacking(self, methods: list[str], seed: int, budget: int) -> list[str]:
+        """Methods whose scores are not kept."""
+        lacking = [method for method in methods if (method, budget, seed) not in self.scores.lines]
+        if len(lacking) < len(methods):
+            self.stages.say(f"seed {seed} after {budget} calls: scores kept{f', but for {lacking}' if lacking else ''}")
+        return lacking
 
-    def require_planners(self, seed: int, budget: int) -> None:
-        """Have the nets and plans of a seed and budget, though their scores may be kept."""
-        if f"plans_{seed}_{budget}" not in self.stages.results:
-            self._planner_run(seed, budget)
+    def _planner_run(self, seed: int, budget: int) -> None:
+        """All planners of one seed and budget whose scores are not kept."""
+        trying = self.trying(seed)
+        lacking = self._lacking([*self.names, *trying], seed, budget)
+        if not lacking:
+            return
+        plans = self._plan(seed, budget)
+        for method in lacking:
+            if method in trying:
+                self._try(method, *trying[method], seed, budget)
+            else:
+                how = How(self.settings_of(method), self._learnt_in(method, seed, budget))
+                self.score(method, seed, budget, plans, partial(self._planned, plans, method), how)
+
+    def require(self, method: str, seed: int, budget: int) -> str:
+        """Have the net, or the policy, that answers come of, though scores may be kept; returns its stage."""
+        if begins_from(method) in PLANNERS:
+            return self._learn(seed, budget)
+        from training.compare import policies
+
+        return policies.train(self, method, seed, budget)
+
+    def settings_of(self, method: str) -> dict[str, Any]:
+        """All that scores of a method depend on besides budget and seed."""
+        config, start = self.config, begins_from(method)
+        if start not in PLANNERS and method != ORACLE:
+            from training.compare import policies  # stable-baselines3 takes seconds to import
+
+            return policies.settings_of(self, method)
+        hops = "simulated for each seed" if config.data is None else "of a file"
+        settings: dict[str, Any] = {"version": PLANNERS_VERSION, "hops": hops, "start": start}
+        if method == ORACLE:
+            return settings | {"search": config.oracle}
+        if start != "nearest":
+            settings |= self.learning
+        own = {"single": "inverse", "ensemble": "inverse", "tandem": "tandem", "cma": "search"}.get(start)
+        settings |= {} if own is None else {own: self.planning[own]}
+        return settings if method == start else settings | self.trying_settings(method)
 
     def trying(self, seed: int) -> dict[str, tuple[str, Callable[[Any], Planner]]]:
         """Methods that simulate hops for each answer: their stage, and how they are made of what was fitted."""
@@ -96,11 +140,6 @@ class Comparison(Question):
             settings["process"] = asdict(BayesianConfig())
         return settings
 
-    def _planner_settings(self, seed: int) -> dict[str, dict[str, Any]]:
-        """What scores of the planners of a seed depend on besides seed and budget, by method."""
-        plans = self.learning | self.planning
-        return dict.fromkeys(self.names, plans) | {m: plans | self.trying_settings(m) for m in self.trying(seed)}
-
     def fitted(self, seed: int, budget: int) -> Fitted:
         """Planners of a seed and budget."""
         if (seed, budget) not in self._fitted:
@@ -111,40 +150,44 @@ class Comparison(Question):
     def _fit(self, net: HopNet, data: HopData, seed: int) -> Any:
         return Fitted(net, data, self.config, seed, self.floor)
 
-    def _planners(self, seed: int, budget: int) -> None:
-        config, tag = self.config, f"{seed}_{budget}"
-        path = self.stages.folder / f"net_{tag}.safetensors"
+    def _learn(self, seed: int, budget: int) -> str:
+        """Train a net; returns its stage."""
+        path = self.stages.folder / f"net_{seed}_{budget}.safetensors"
+        self.measure_floor()  # which planners are told
         data = self.learnt(seed, budget)
 
-        def learn() -> Results:
-            net, card = fit_net(data, config, seed)
+        def work() -> Results:
+            net, card = fit_net(data, self.config, seed)
             model.save(net, path, card)
             return {"seconds": card["seconds"]}
 
-        files = [path.name, beside(path, CARD).name]
-        self.stages.run(f"net_{tag}", self.learning, learn, needs=[f"hops_{tag}"], files=files)
+        if path.stem not in self.stages.results:
+            files = [path.name, beside(path, CARD).name]
+            self.stages.run(path.stem, self.learning, work, needs=[f"hops_{seed}_{budget}"], files=files)
+        return path.stem
 
-        def plan() -> Results:
+    def _plan(self, seed: int, budget: int) -> str:
+        """Answers of the planners that simulate nothing; returns their stage."""
+        net, name = self._learn(seed, budget), f"plans_{seed}_{budget}"
+
+        def work() -> Results:
             fitted = self.fitted(seed, budget)
             answers = {name: fitted[name].predict(self.targets)[0].tolist() for name in self.names}
             return {name: {"stretches": answers[name], "seconds": fitted.seconds[name]} for name in self.names}
 
-        settings = self.planning | {"planners": self.names}
-        self.stages.run(f"plans_{tag}", settings | {"targets": self.targets.tolist()}, plan, needs=[f"net_{tag}", "floor"])
-        for name, content in self._planner_settings(seed).items():
-            if name in self.names:
-                answers = partial(self._planned, f"plans_{tag}", name)
-                self.score(name, seed, budget, f"plans_{tag}", answers, How(content, self._learnt_in(name, tag)))
+        settings = self.planning | {"planners": self.names, "targets": self.targets.tolist()}
+        self.stages.run(name, settings, work, needs=[net, "floor"])
+        return name
 
     @property
     def learning(self) -> dict[str, Any]:
         """What nets depend on besides hops."""
         return {"surrogate": asdict(self.config.surrogate), "updates": self.config.updates}
 
-    def _learnt_in(self, planner: str, tag: str) -> float:
+    def _learnt_in(self, planner: str, seed: int, budget: int) -> float:
         """Wall time that a planner learnt for, simulating left out [s]."""
-        own = float(self.stages.results[f"plans_{tag}"][planner]["seconds"])
-        return own + (0.0 if planner == "nearest" else self.stages.seconds[f"net_{tag}"])
+        own = float(self.stages.results[f"plans_{seed}_{budget}"][planner]["seconds"])
+        return own + (0.0 if planner == "nearest" else self.stages.seconds[f"net_{seed}_{budget}"])
 
     @property
     def planning(self) -> dict[str, Any]:
@@ -154,8 +197,7 @@ class Comparison(Question):
             "inverse": asdict(config.inverse),
             "tandem": asdict(config.tandem),
             "search": config.search,
-            "images": True,  # of stored hops, which planners did without before
-            "least_equal": LEAST_EQUAL,
+            "version": PLANNERS_VERSION,
         }
 
     def _planned(self, stage: str, name: str) -> Results:
@@ -166,16 +208,15 @@ class Comparison(Question):
         """Planners that can run here."""
         return [name for name in PLANNERS if name != "cma" or find_spec("cma")]
 
-    def _tried(self, method: str, stage: str, make: Callable[[Any], Planner], seed: int, budget: int) -> None:
+    def _try(self, method: str, stage: str, make: Callable[[Any], Planner], seed: int, budget: int) -> None:
         """Answers of a planner that tries hops, and their score."""
-        tag = f"{seed}_{budget}"
-        name = f"{stage}_{tag}"
+        name, plans = f"{stage}_{seed}_{budget}", f"plans_{seed}_{budget}"
 
         def work() -> Results:
             return {"stretches": make(self.fitted(seed, budget)).predict(self.targets)[0].tolist()}
 
-        self.stages.run(name, self.trying_settings(method), work, needs=[f"plans_{tag}"])
-        how = How(self._planner_settings(seed)[method], self._learnt_in(begins_from(method), tag))
+        self.stages.run(name, self.trying_settings(method), work, needs=[plans])
+        how = How(self.settings_of(method), self._learnt_in(begins_from(method), seed, budget))
         self.score(method, seed, budget, name, lambda: self.stages.results[name], how)
 
     def _best(self, fitted: Any, tries: int) -> Planner:
@@ -188,22 +229,20 @@ class Comparison(Question):
         return BayesianPlanner(fitted.inverse, self.hops.land, fitted.data["stretches"], fitted.data["landing"], tries)
 
     def _oracle(self) -> None:
-        if not self.config.oracle or not find_spec("cma"):
+        if not self.config.oracle or not find_spec("cma") or ORACLE in self.scores.methods:
             return
         budget = max(self.config.budgets)
-        settings = {"search": asdict(self._search), "images": True}
-        if self.is_kept({ORACLE: settings}, 0, budget):
-            return
-        self.require_planners(0, budget)
+        net = self._learn(0, budget)
 
         def work() -> Results:
             before = self.hops.calls
             stretches, _ = self._search_from(self.fitted(0, budget)["nearest"]).predict(self.targets)
             return {"stretches": stretches.tolist(), "calls_per_answer": (self.hops.calls - before) / len(self.targets)}
 
-        self.stages.run(ORACLE, settings | {"targets": self.targets.tolist()}, work, needs=[f"net_0_{budget}"])
-        calls = self.stages.results[ORACLE]["calls_per_answer"]
-        self.score(ORACLE, 0, budget, ORACLE, lambda: self.stages.results[ORACLE], How(settings, 0.0, calls))
+        settings = {"search": asdict(self._search), "images": True, "targets": self.targets.tolist()}
+        found = self.stages.run(ORACLE, settings, work, needs=[net])
+        how = How(self.settings_of(ORACLE), 0.0, found["calls_per_answer"])
+        self.score(ORACLE, 0, budget, ORACLE, lambda: found, how)
 
     def _search_from(self, start: Planner) -> Planner:
         """CMA-ES on the simulator."""
@@ -216,16 +255,9 @@ class Comparison(Question):
 
     def policy(self, method: str, seed: int, budget: int) -> None:
         """Train a policy, and score it, unless its score is kept."""
-        from training.compare import policies  # stable-baselines3 takes seconds to import
+        if self._lacking([method], seed, budget):
+            from training.compare import policies
 
-        if not self.is_kept({method: policies.settings_of(self, method, 0, budget)}, seed, budget):
-            policies.run(self, method, seed, budget)
-
-    def require_policy(self, method: str, seed: int, budget: int) -> None:
-        """Have a policy's files, though its score may be kept."""
-        from training.compare import policies
-
-        if f"policy_{method}_{seed}_{budget}" not in self.stages.results:
             policies.run(self, method, seed, budget)
 
 
@@ -250,6 +282,6 @@ def main(config: CompareConfig) -> None:
     comparison.scores.write(folder / "scores.jsonl")
     report.write_all(outcome, folder / "results.md", folder)
     if config.write:
-        comparison.scores.write(config.kept_path)
+        comparison.scores.write(config.kept_path, anew=config.anew)
         report.write_all(outcome, Path("docs/results.md"), Path("docs/images"), Path("README.md"))
     print(f"{report.by_budget(outcome)}\n\n{folder / 'results.md'}")

@@ -24,7 +24,7 @@ from training.compare.question import BLOCK, FLOOR_HOPS
 from training.compare.run import Comparison
 from training.evolution import EvolutionConfig
 from training.hops import VariedHops
-from training.inverse import InversePlanner, fit_energy
+from training.inverse import START_SEED, InversePlanner, fit_energy
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner
 from training.similarity import alike_data, likeness
@@ -185,12 +185,14 @@ class VariedFitted:
         """Scene values (k,) [SI] to the robust planner of that scene."""
         images = self.net.landing_images
         return inverse_planners(
-            self.landing, self.kriging, self.config.inverse, energy=self.energy, images=images, seed=self.seed
+            self.landing, self.kriging, self.config.inverse, energy=self.energy, images=images, seed=self.seed + START_SEED
         )
 
     @one_thread()
     def _of_one_net(self, values: Floats) -> InversePlanner:
-        return InversePlanner(self._first.at(values), self.config.inverse, images=self.net.landing_images)
+        return InversePlanner(
+            self._first.at(values), self.config.inverse, images=self.net.landing_images, seed=self.seed + START_SEED
+        )
 
     @cached_property
     def _first(self) -> FrozenLanding:
