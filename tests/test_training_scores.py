@@ -192,6 +192,7 @@ def test_other_settings_replace_what_they_make_stale_and_nothing_else(tmp_path: 
             f"score_{method}_0_16" for method in comparison.scores.methods
         }
         assert stale <= gone
+    assert "oracle" in run.comparison_of(replace(committed, oracle=0)).scores.methods  # not asked for, and no worse for that
     monkeypatch.setattr(run, "PLANNERS_VERSION", 999)
     assert run.comparison_of(committed).scores.methods == []  # SAC's were of other hyper-parameters
 

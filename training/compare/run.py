@@ -48,6 +48,8 @@ class Comparison(Question):
     def _leave_out_stale(self) -> None:
         """Of the kept scores, take only those that were made with today's settings."""
         for method in self.scores.methods:
+            if method == ORACLE and not self.config.oracle:
+                continue  # not asked for, and no worse for that
             if self.scores.settings(method) != hash_of(self.settings_of(method)):
                 gone = self.scores.drop(method)
                 self.stages.say(f"{method}: {gone} kept scores were made with other settings, left out")
