@@ -26,7 +26,11 @@ NEIGHBOURS = 24
 #: Groups of points that are worked on together: all at once, a planner's pool of 100 000 would take 3 GB.
 BLOCK = 2048
 #: Least share of the variance that counts as noise, so that kernel matrices have inverses.
-LEAST_NOISE = 1e-4
+LEAST_NOISE = 1e-6
+#: Least standard deviation far from all hops [m], where a net misses nothing.
+LEAST_SIGMA = 1e-9
+#: How often the noise of a length scale is found anew from the variance that it leads to.
+PASSES = 3
 #: Hops that the scale is chosen on, at most.
 MOST_HELD = 1000
 
@@ -121,13 +125,15 @@ def fit_process(
     known, held = split["train"], split["validation"][:MOST_HELD]
     if len(known) < 2 or len(held) < 2:
         return None
-    noise = max(LEAST_NOISE, float(floor**2 / np.mean(residuals[held] ** 2)))
     found = []
     for length in LENGTHS:
-        process = Kriging(points[known], residuals[known], *images, Scale(length, noise, 1.0, 0.0))
-        shift, share = process.shift(points[held])
-        share = share[:, None] + noise
-        sigma = float(np.sqrt(((residuals[held] - shift) ** 2 / share).mean()))  # the likeliest, in closed form
+        sigma = max(float(np.sqrt(np.mean(residuals[held] ** 2))), LEAST_SIGMA)
+        for _ in range(PASSES):  # what the floor is a share of is known only once it is taken into account
+            noise = max(LEAST_NOISE, (floor / sigma) ** 2)
+            process = Kriging(points[known], residuals[known], *images, Scale(length, noise, 1.0, 0.0))
+            shift, share = process.shift(points[held])
+            share = share[:, None] + noise
+            sigma = max(float(np.sqrt(((residuals[held] - shift) ** 2 / share).mean())), LEAST_SIGMA)  # the likeliest
         found.append(Scale(length, noise, sigma, float(np.log(sigma**2 * share).mean())))
     rows = np.sort(np.concatenate([known, split["validation"]]))
     return Kriging(points[rows], residuals[rows], *images, min(found, key=lambda scale: scale.log_loss))

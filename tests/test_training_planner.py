@@ -372,6 +372,26 @@ def test_kriging_finds_what_the_net_misses_and_knows_how_well() -> None:
     assert fit_kriging(net, few, 0.0, 0.0) is None
 
 
+@pytest.mark.parametrize("length", [0.05, 0.4])
+def test_doubt_at_a_stored_hop_is_the_floor_whatever_the_length_scale(length: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long one goes with a large variance far from all hops; a floor taken for the same share of that was ten times itself."""
+    monkeypatch.setattr(kriging, "LENGTHS", (length,))
+    net = small_net()
+    stretches, _, residuals = rough_data(net, 1000, 0)
+    images = net.permutations.numpy(), net.signs[:, :2].numpy().astype(np.float64)
+    split = {"train": np.arange(900), "validation": np.arange(900, 1000)}
+    floor = 3e-4
+    process = kriging.fit_process(stretches, residuals, images, split, floor)
+    assert process is not None
+    assert process.scale.sigma * np.sqrt(process.scale.noise) == pytest.approx(floor, rel=0.1)  # by three passes
+    _, variance = process(torch.from_numpy(stretches[:50].astype(np.float32)))
+    # of a hop that is known to the floor, and repeated: between a root half and a root two of it, as images may coincide
+    assert (np.sqrt(variance.numpy()) < 1.5 * floor).all()
+    still = kriging.fit_process(stretches, np.zeros_like(residuals), images, split, floor)
+    assert still is not None
+    assert np.isfinite(still.shift(stretches[:5])[0]).all()
+
+
 def test_hops_in_turn_find_what_the_surrogate_misses() -> None:
     """Waves of 5 mm that the surrogate knows nothing of: four hops more take another factor of ten off."""
     net = small_net()

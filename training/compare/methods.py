@@ -15,7 +15,7 @@ BAYESIAN = "bayes"
 #: How the names of policies end that know the symmetries; before it stands the algorithm's.
 SYMMETRIC = "_symmetric"
 #: To raise with whatever changes answers of a planner and is no setting of it: scores made before are not kept then.
-PLANNERS_VERSION = 2
+PLANNERS_VERSION = 3
 #: CMA-ES on the simulator: what can be had, at a price.
 ORACLE = "oracle"
 
