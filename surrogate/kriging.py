@@ -125,12 +125,12 @@ def fit_process(
     known, held = split["train"], split["validation"][:MOST_HELD]
     if len(known) < 2 or len(held) < 2:
         return None
-    found = []
+    found, process = [], Kriging(points[known], residuals[known], *images, Scale(LENGTHS[0], LEAST_NOISE, 1.0, 0.0))
     for length in LENGTHS:
         sigma = max(float(np.sqrt(np.mean(residuals[held] ** 2))), LEAST_SIGMA)
         for _ in range(PASSES):  # what the floor is a share of is known only once it is taken into account
             noise = max(LEAST_NOISE, (floor / sigma) ** 2)
-            process = Kriging(points[known], residuals[known], *images, Scale(length, noise, 1.0, 0.0))
+            process.scale = Scale(length, noise, 1.0, 0.0)
             shift, share = process.shift(points[held])
             share = share[:, None] + noise
             sigma = max(float(np.sqrt(((residuals[held] - shift) ** 2 / share).mean())), LEAST_SIGMA)  # the likeliest
