@@ -128,7 +128,7 @@ def fit_process(
     found, process = [], Kriging(points[known], residuals[known], *images, Scale(LENGTHS[0], LEAST_NOISE, 1.0, 0.0))
     for length in LENGTHS:
         sigma = max(float(np.sqrt(np.mean(residuals[held] ** 2))), LEAST_SIGMA)
-        for _ in range(PASSES):  # what the floor is a share of is known only once it is taken into account
+        for _ in range(PASSES if floor else 1):  # what the floor is a share of is known only once it is taken into account
             noise = max(LEAST_NOISE, (floor / sigma) ** 2)
             process.scale = Scale(length, noise, 1.0, 0.0)
             shift, share = process.shift(points[held])

@@ -141,7 +141,7 @@ def test_a_comparison_keeps_a_training_until_its_policy_is_written(tmp_path: Pat
 
     monkeypatch.setattr("training.compare.policies.train_policy", trained)
     comparison = Comparison(CompareConfig(out=tmp_path, quick=True, progress=False))
-    monkeypatch.setattr(comparison, "score", lambda *_: None)
+    monkeypatch.setattr(comparison, "score", lambda *_, **__: None)
     state = tmp_path / "policy_sac_0_16.training"
     with monkeypatch.context() as patch:
         patch.setattr(ActorPolicy, "save", full_disk)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from surrogate.storage import CARD, POLICY_STATE, beside
 from training.algorithms import LEAST_UPDATES, hyperparameters, is_cap_passed
 from training.compare.methods import algorithm_of
-from training.compare.question import How
 from training.policies import ActorPolicy
 from training.sb3_vec_env import ENV_SEEDS
 from training.stages import Results
@@ -85,5 +84,4 @@ def run(comparison: Comparison, method: str, seed: int, budget: int) -> None:
     def answers() -> Results:
         return {"stretches": ActorPolicy.load(path).predict(comparison.targets)[0]}
 
-    how = How(comparison.settings_of(method), found["seconds"] - found["simulating"])
-    comparison.score(method, seed, budget, name, answers, how)
+    comparison.score(method, seed, budget, name, answers, seconds=found["seconds"] - found["simulating"])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -33,16 +34,7 @@ FLOOR_HOPS = 64
 NOTED = ("numpy", "numba", "torch", "stable-baselines3")
 
 
-@dataclass(frozen=True)
-class How:
-    """How a method came to its answers."""
-
-    settings: Mapping[str, Any]  #: all that scores depend on besides budget and seed
-    seconds: float  #: wall time that it learnt for, simulating left out [s]
-    calls_per_answer: float | None = None  #: hops for each answer, where they were counted
-
-
-class Question:
+class Question(ABC):
     """Targets in one scene; see ``varied`` for scenes that vary."""
 
     hops: Any
@@ -90,6 +82,10 @@ class Question:
         given = {"perturbations": self.config.perturbations, "places": counts, "targets": hash_of(self.targets.tolist())}
         moved = {"moved_by": POSITION, "moved_seed": MOVED_SEED, "floor_hops": FLOOR_HOPS}
         return self.base | given | moved | {"model_version": MODEL_VERSION}
+
+    @abstractmethod
+    def settings_of(self, method: str) -> dict[str, Any]:
+        """All that scores of a method depend on besides budget and seed."""
 
     def pool(self, seed: int) -> HopData:
         """The hops of a seed: as many as the largest budget; smaller budgets are its first rows."""
@@ -152,9 +148,15 @@ class Question:
         budget: int,
         needs: str,
         answers: Callable[[], Any],
-        how: How,
+        *,
+        seconds: float,
+        calls_per_answer: float | None = None,
     ) -> None:
-        """Simulate the answers of a method, from their start and from moved ones, and take down how near they come."""
+        """Simulate the answers of a method, from their start and from moved ones, and take down how near they come.
+
+        ``needs`` is the stage that the answers come of, ``seconds`` the wall time that the method learnt for, simulating left
+        out [s].
+        """
 
         def work() -> Results:
             stretches = np.array(answers()["stretches"])
@@ -174,10 +176,10 @@ class Question:
                 seed,
                 errors,
                 scatter,
-                rounded(how.seconds),
-                hash_of(how.settings),
+                rounded(seconds),
+                hash_of(self.settings_of(method)),
                 self.stages.dates[name][:10],
                 ", ".join(f"{package} {versions[package]}" for package in NOTED if package in versions),
-                how.calls_per_answer,
+                calls_per_answer,
             )
         )

@@ -19,7 +19,7 @@ from training.compare import targets as registered
 from training.compare.config import CompareConfig
 from training.compare.learn import Fitted, fit_net
 from training.compare.methods import BAYESIAN, ORACLE, PLANNERS, PLANNERS_VERSION, REFINED, answer_calls, begins_from
-from training.compare.question import How, Question
+from training.compare.question import Question
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner
@@ -92,8 +92,8 @@ class Comparison(Question):
             if method in trying:
                 self._try(method, *trying[method], seed, budget)
             else:
-                how = How(self.settings_of(method), self._learnt_in(method, seed, budget))
-                self.score(method, seed, budget, plans, partial(self._planned, plans, method), how)
+                seconds = self._learnt_in(method, seed, budget)
+                self.score(method, seed, budget, plans, partial(self._planned, plans, method), seconds=seconds)
 
     def require(self, method: str, seed: int, budget: int) -> str:
         """Have the net, or the policy, that answers come of, though scores may be kept; returns its stage."""
@@ -218,8 +218,8 @@ class Comparison(Question):
             return {"stretches": make(self.fitted(seed, budget)).predict(self.targets)[0].tolist()}
 
         self.stages.run(name, self.trying_settings(method), work, needs=[plans])
-        how = How(self.settings_of(method), self._learnt_in(begins_from(method), seed, budget))
-        self.score(method, seed, budget, name, lambda: self.stages.results[name], how)
+        seconds = self._learnt_in(begins_from(method), seed, budget)
+        self.score(method, seed, budget, name, lambda: self.stages.results[name], seconds=seconds)
 
     def _best(self, fitted: Any, tries: int) -> Planner:
         return BestOfPlanner(fitted.inverse, self.hops.land, tries)
@@ -243,8 +243,8 @@ class Comparison(Question):
 
         settings = {"search": asdict(self._search), "images": True, "targets": self.targets.tolist()}
         found = self.stages.run(ORACLE, settings, work, needs=[net])
-        how = How(self.settings_of(ORACLE), 0.0, found["calls_per_answer"])
-        self.score(ORACLE, 0, budget, ORACLE, lambda: found, how)
+        calls = found["calls_per_answer"]
+        self.score(ORACLE, 0, budget, ORACLE, lambda: found, seconds=0.0, calls_per_answer=calls)
 
     def _search_from(self, start: Planner) -> Planner:
         """CMA-ES on the simulator."""
