@@ -178,5 +178,5 @@ def test_a_comparison_that_asks_for_it_adds_it_and_keeps_all_else(tmp_path: Path
     assert outcome.latency("bayes2") is not None
     assert outcome.learning_seconds("bayes2", 16) > 0
     answers = json.loads((tmp_path / "quick" / "stages" / "bayes_0_16.json").read_text())["results"]["stretches"]
-    plans = json.loads((tmp_path / "quick" / "stages" / "plans_0_16.json").read_text())["results"]["ensemble"]["stretches"]
+    plans = json.loads((tmp_path / "quick" / "stages" / "plan_ensemble_0_16.json").read_text())["results"]["stretches"]
     assert np.abs(np.array(answers) - np.array(plans)).max() <= BayesianConfig().radius + 1e-12

@@ -19,6 +19,7 @@ from surrogate.kriging import Kriging, Scale, fit_kriging
 from surrogate.model import HopNet, NetConfig, scene_symmetries
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.scene_ranges import scene_ranges
 from training import refine
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.hops import Hops
@@ -27,6 +28,7 @@ from training.planner import BestOfPlanner, NearestHopPlanner, targets_of, with_
 from training.policies import ActorPolicy, _mlp
 from training.refine import RefiningPlanner
 from training.similarity import Scaling
+from training.symmetry import Symmetry
 from training.tandem import TandemConfig, TandemPlanner
 
 
@@ -479,6 +481,33 @@ def test_hops_in_turn_do_not_get_stuck_near_the_end_of_the_range() -> None:
     target = np.array([[0.0215, 0.0080]])
     assert RefiningPlanner(Near(), real, 1).refine(target).errors > 1e-3
     assert RefiningPlanner(Near(), real, 3).refine(target).errors < 1e-9
+
+
+def test_hops_in_turn_from_a_stored_hop_do_not_simulate_it_again() -> None:
+    """Its landing, or its image's, is known: the first hop is a step, and the answer no worse than the stored one."""
+    slope = np.array([[0.13, -0.13, -0.13, 0.13], [0.016, 0.016, -0.016, -0.016]])
+    images = Symmetry.of(scene_ranges("earth")).images
+    asked = []
+
+    def real(stretches: np.ndarray) -> np.ndarray:
+        asked.append(stretches)
+        return (stretches - 0.5) @ slope.T
+
+    stretches = np.random.default_rng(0).uniform(0.3, 0.7, (60, 4))
+    nearest = NearestHopPlanner(stretches, (stretches - 0.5) @ slope.T, images=images)
+    targets = np.array([[0.02, 0.003], [-0.03, 0.001], [0.0, 0.0]])
+    start = nearest.predict(targets)[0]
+    np.testing.assert_allclose(nearest.recall(start), (start - 0.5) @ slope.T, atol=1e-12)
+    assert np.isnan(nearest.recall(start + 1e-9)).all()
+    one = RefiningPlanner(nearest, real, 1)
+    found = one.refine(targets)
+    assert one.simulator_calls == 3
+    assert not (asked[0] == start).all(axis=1).any()
+    assert (found.errors < 1e-9).all()  # the slope of the stored hops is that of the map
+    # where no step flies, the stored hop is the answer, which nobody has simulated anew
+    lost = RefiningPlanner(nearest, lambda s: np.full((len(s), 2), np.nan), 3).refine(targets)
+    np.testing.assert_array_equal(lost.stretches, start)
+    np.testing.assert_array_equal(lost.landings, nearest.recall(start))
 
 
 def test_nearest_hop_counts_images_and_leaves_out_hops_without_a_landing() -> None:

@@ -151,8 +151,14 @@ def test_kept_scores_are_gone_on_from_in_another_folder(tmp_path: Path, monkeypa
     assert [row.seed for row in both.of("sac", 16)] == [row.seed for row in both.of("ensemble", 16)] == [0, 1]
     # a method more is run and timed with what it takes, and the others are not
     more = done(small("sixth", refine=(2,), policy_budgets=()))
-    assert {"net_0_16", "plans_0_16", "score_refine2_0_16", "score_repeat2_0_16", "latency_refine2_16"} <= more
+    assert {"net_0_16", "plan_ensemble_0_16", "score_refine2_0_16", "score_repeat2_0_16", "latency_refine2_16"} <= more
     assert not {"score_ensemble_0_16", "latency_ensemble_16", "oracle"} & more
+    # one that needs no net trains none
+    hops = {"hops_0_0_16", "hops_0_16", "floor"}
+    needed = {"plan_nearest_0_16", "repeat3_0_16", "score_repeat3_0_16"}
+    with monkeypatch.context() as patched:
+        patched.setattr(run.Comparison, "starts", ("nearest",))
+        assert done(small("unlearnt", refine=(3,), policy_budgets=(), latencies=0)) == hops | needed
     # times of fewer hops do not replace those of more
     timed = set(Scores.read(kept, both.task).latencies)
     assert {"nearest", "ensemble", "best2", "refine2", "cma", "sac"} <= timed

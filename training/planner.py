@@ -107,6 +107,12 @@ class NearestHopPlanner:
     def _tried(self) -> KDTree:
         return KDTree(self.stretches)
 
+    def recall(self, stretches: np.ndarray) -> np.ndarray:
+        """Where stored hops, or their images, of just these stretches (n, n_actuators) landed, not-a-number where there are
+        none, shape (n, 2) [m]."""
+        away, which = self._tried.query(stretches)
+        return np.where(away[:, None] == 0.0, self.landings[which], np.nan)
+
     def slope(self, stretches: np.ndarray) -> np.ndarray:
         """Of the plane fitted to the landings of the nearest stored hops and their images; see ``SlopedPlanner``."""
         near = self._tried.query(stretches, min(NEIGHBOURS, self._tried.n))[1].reshape(len(stretches), -1)

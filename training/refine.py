@@ -31,7 +31,11 @@ class Refined(NamedTuple):
 
 
 class RefiningPlanner:
-    """Answer with the best of ``tries`` hops, the first as ``start`` plans it, each other a secant step from the best so far."""
+    """Answer with the best of ``tries`` hops, the first as ``start`` plans it, each other a secant step from the best so far.
+
+    A start that can ``recall`` its answers' landings, as the nearest stored hop can, is not simulated again: all hops are then
+    steps, and the start itself is among those that the best is chosen from.
+    """
 
     def __init__(self, start: SlopedPlanner, land: Land, tries: int = 8) -> None:
         if tries < 1:
@@ -52,22 +56,38 @@ class RefiningPlanner:
         targets = targets_of(targets)
         asked, _ = self.start.predict(targets)
         slope = self.start.slope(asked)
-        best, there, least = asked, np.full(targets.shape, np.nan), np.full(len(targets), np.inf)
+        best, there = asked, self._recalled(asked)
+        least = _distance(there, targets)
+        asked = np.where(np.isfinite(least)[:, None], _stepped(best, slope, targets - there), asked)
         for k in range(self.tries):
             landings = np.asarray(self.land(asked), dtype=np.float64)
             self.simulator_calls += len(asked)
-            error = np.linalg.norm(landings - targets, axis=1)
+            error = _distance(landings, targets)
             flew, known = np.isfinite(error), np.isfinite(least)
             slope = np.where((flew & known)[:, None, None], _updated(slope, asked - best, landings - there), slope)
             better = flew & (error < least)
             best, there = np.where(better[:, None], asked, best), np.where(better[:, None], landings, there)
             least = np.where(better, error, least)
             if k + 1 < self.tries:
-                step = _step(best, slope, np.nan_to_num(targets - there))
                 # after a failed hop: half the way back to the best, or to the middle of the range where there is none
                 back = 0.5 * (asked + np.where(np.isfinite(least)[:, None], best, sum(STRETCH_RANGE) / 2))
-                asked = np.where(flew[:, None], np.clip(best + step, *STRETCH_RANGE), back)
+                asked = np.where(flew[:, None], _stepped(best, slope, targets - there), back)
         return Refined(best, there, least)
+
+    def _recalled(self, asked: Floats) -> Floats:
+        """Where hops of ``asked`` (n, n_actuators) are known to land, not-a-number where they are not, shape (n, 2) [m]."""
+        recall = getattr(self.start, "recall", None)
+        return np.full((len(asked), 2), np.nan) if recall is None else np.asarray(recall(asked), dtype=np.float64)
+
+
+def _distance(landings: Floats, targets: Floats) -> Floats:
+    """From landings to targets (n, 2) [m], infinite where none is known, shape (n,) [m]."""
+    return np.nan_to_num(np.linalg.norm(landings - targets, axis=1), nan=np.inf)
+
+
+def _stepped(best: Floats, slope: Floats, wanted: Floats) -> Floats:
+    """What to try next: stretches (n, n_actuators) that land ``wanted`` (n, 2) [m] from ``best``, as far as the slope says."""
+    return np.clip(best + _step(best, slope, np.nan_to_num(wanted)), *STRETCH_RANGE)
 
 
 def _updated(slope: Floats, moved: Floats, came: Floats) -> Floats:

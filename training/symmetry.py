@@ -32,6 +32,11 @@ class Symmetry:
         permutations, signs = (lattice or Lattice()).symmetries_keeping(horizontal)
         return cls(tuple(map(tuple, permutations.tolist())), tuple((float(x), float(y)) for x, y in signs))
 
+    @property
+    def images(self) -> tuple[np.ndarray, np.ndarray]:
+        """As arrays: permutations of stretches (g, n_actuators) and signs of landings (g, 2)."""
+        return np.array(self.permutations, dtype=np.int64), np.array(self.signs)
+
     def fold(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Observations (n, d), target first, with the image of their target that has the greatest x, then y; and which it is.
 

@@ -29,7 +29,7 @@ from training.compare.config import CompareConfig
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.hops import Hops
 from training.inverse import START_SEED, InversePlanner, fit_energy
-from training.planner import NearestHopPlanner, Planner
+from training.planner import Images, NearestHopPlanner, Planner
 from training.tandem import TandemPlanner
 
 #: Parts of a file at whose beginnings seeds begin.
@@ -100,23 +100,33 @@ def fit_net(data: HopData, config: CompareConfig, seed: int) -> tuple[HopNet, di
 class Fitted:
     """Planners made, when they are asked for, from the hops in ``data`` and the surrogate trained on them.
 
-    ``floor`` [m] as in ``fit_kriging``.
+    ``load`` reads the surrogate, once a planner needs it; ``floor`` [m] as in ``fit_kriging``.
     """
 
-    def __init__(self, net: HopNet, data: HopData, config: CompareConfig, seed: int, floor: float) -> None:
-        self.net, self.data, self.config, self.seed, self.floor = net, data.rows(data.usable), config, seed, floor
-        self.landing = FrozenLanding(net)
+    def __init__(
+        self, load: Callable[[], HopNet], data: HopData, config: CompareConfig, seed: int, images: Images, floor: float
+    ) -> None:
+        self._load, self.data, self.config, self.seed, self.images = load, data.rows(data.usable), config, seed, images
+        self.floor = floor
         #: What making each planner took beyond simulating and the surrogate [s].
         self.seconds: dict[str, float] = {}
         self._made: dict[str, Planner] = {}
+
+    @cached_property
+    def net(self) -> HopNet:
+        """The surrogate."""
+        return self._load()
+
+    @cached_property
+    def landing(self) -> FrozenLanding:
+        """Its members' landings."""
+        return FrozenLanding(self.net)
 
     def __getitem__(self, name: str) -> Planner:
         if name not in self._made:
             started = time.perf_counter()
             make: dict[str, Callable[[], Planner]] = {
-                "nearest": lambda: NearestHopPlanner(
-                    self.data["stretches"], self.data["landing"], images=self.net.landing_images
-                ),
+                "nearest": lambda: NearestHopPlanner(self.data["stretches"], self.data["landing"], images=self.images),
                 "single": lambda: InversePlanner(
                     FrozenLanding(self.net.member(0)),
                     self.config.inverse,

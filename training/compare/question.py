@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,9 @@ from training.compare.scores import Line, Scores, errors_and_scatter, rounded
 from training.compare.statistics import interquartile_mean
 from training.hops import SEED as MOVED_SEED
 from training.hops import Hops
+from training.planner import Images
 from training.stages import Results, Stages
+from training.symmetry import Symmetry
 
 #: Hops of a pool that are simulated, and kept, together.
 BLOCK = 2048
@@ -69,6 +72,11 @@ class Question(ABC):
     def _varying(self) -> dict[str, Any]:
         """What records depend on where scenes vary."""
         return {}
+
+    @cached_property
+    def images(self) -> Images:
+        """Symmetries that all scenes share."""
+        return Symmetry.of(self.scenes).images
 
     @property
     def units(self) -> np.ndarray:

@@ -87,18 +87,18 @@ class Comparison(Question):
         lacking = self._lacking([*self.names, *trying], seed, budget)
         if not lacking:
             return
-        plans = self._plan(seed, budget)
         for method in lacking:
+            planner = begins_from(method)
+            plan = self._plan(planner, seed, budget)
+            seconds = self._learnt_in(planner, seed, budget)
             if method in trying:
-                self._try(method, *trying[method], seed, budget)
-            else:
-                seconds = self._learnt_in(method, seed, budget)
-                self.score(method, seed, budget, plans, partial(self._planned, plans, method), seconds=seconds)
+                plan = self._try(*trying[method], self.trying_settings(method), plan, seed, budget)
+            self.score(method, seed, budget, plan, partial(self.stages.results.__getitem__, plan), seconds=seconds)
 
     def require(self, method: str, seed: int, budget: int) -> str:
-        """Have the net, or the policy, that answers come of, though scores may be kept; returns its stage."""
+        """Have the hops, the net or the policy that answers come of, though scores may be kept; returns its stage."""
         if begins_from(method) in PLANNERS:
-            return self._learn(seed, budget)
+            return self._basis(begins_from(method), seed, budget)
         from training.compare import policies
 
         return policies.train(self, method, seed, budget)
@@ -116,8 +116,7 @@ class Comparison(Question):
             return settings | {"search": config.oracle}
         if start != "nearest":
             settings |= self.learning
-        own = {"single": "inverse", "ensemble": "inverse", "tandem": "tandem", "cma": "search"}.get(start)
-        settings |= {} if own is None else {own: self.planning[own]}
+        settings |= self._own_settings(start)
         return settings if method == start else settings | self.trying_settings(method)
 
     def trying(self, seed: int) -> dict[str, tuple[str, Callable[[Any], Planner]]]:
@@ -138,6 +137,8 @@ class Comparison(Question):
         settings: dict[str, Any] = {"tries": answer_calls(method)}
         if method.startswith(tuple(REFINED.values())):
             settings["method"] = "secant, stretches held at the ends of their range"
+            if method.startswith(REFINED["nearest"]):
+                settings["begins"] = "from what the stored hop is known to land at"
         if method.startswith(BAYESIAN):
             settings["process"] = asdict(BayesianConfig())
         return settings
@@ -145,17 +146,24 @@ class Comparison(Question):
     def fitted(self, seed: int, budget: int) -> Fitted:
         """Planners of a seed and budget."""
         if (seed, budget) not in self._fitted:
-            net, _ = model.load(self.stages.folder / f"net_{seed}_{budget}.safetensors")
-            self._fitted = {(seed, budget): self._fit(net, self.learnt(seed, budget), seed)}
+            path = self.stages.folder / f"net_{seed}_{budget}.safetensors"
+            self._fitted = {(seed, budget): self._fit(lambda: model.load(path)[0], self.learnt(seed, budget), seed)}
         return self._fitted[seed, budget]
 
-    def _fit(self, net: HopNet, data: HopData, seed: int) -> Any:
-        return Fitted(net, data, self.config, seed, self.floor)
+    def _fit(self, load: Callable[[], HopNet], data: HopData, seed: int) -> Any:
+        return Fitted(load, data, self.config, seed, self.images, self.floor)
+
+    def _basis(self, planner: str, seed: int, budget: int) -> str:
+        """What a planner is made from: the hops, where it needs nothing else, or the net; returns its stage."""
+        self.measure_floor()  # which planners are told
+        if planner != "nearest":
+            return self._learn(seed, budget)
+        self.learnt(seed, budget)
+        return f"hops_{seed}_{budget}"
 
     def _learn(self, seed: int, budget: int) -> str:
         """Train a net; returns its stage."""
         path = self.stages.folder / f"net_{seed}_{budget}.safetensors"
-        self.measure_floor()  # which planners are told
         data = self.learnt(seed, budget)
 
         def work() -> Results:
@@ -168,17 +176,19 @@ class Comparison(Question):
             self.stages.run(path.stem, self.learning, work, needs=[f"hops_{seed}_{budget}"], files=files)
         return path.stem
 
-    def _plan(self, seed: int, budget: int) -> str:
-        """Answers of the planners that simulate nothing; returns their stage."""
-        net, name = self._learn(seed, budget), f"plans_{seed}_{budget}"
+    def _plan(self, planner: str, seed: int, budget: int) -> str:
+        """Answers of a planner that simulates nothing; returns their stage."""
+        name = f"plan_{planner}_{seed}_{budget}"
+        if name in self.stages.results:
+            return name
 
         def work() -> Results:
             fitted = self.fitted(seed, budget)
-            answers = {name: fitted[name].predict(self.targets)[0].tolist() for name in self.names}
-            return {name: {"stretches": answers[name], "seconds": fitted.seconds[name]} for name in self.names}
+            answers = fitted[planner].predict(self.targets)[0].tolist()
+            return {"stretches": answers, "seconds": fitted.seconds[planner]}
 
-        settings = self.planning | {"planners": self.names, "targets": self.targets.tolist()}
-        self.stages.run(name, settings, work, needs=[net, "floor"])
+        settings = {"version": PLANNERS_VERSION, "targets": self.targets.tolist()} | self._own_settings(planner)
+        self.stages.run(name, settings, work, needs=[self._basis(planner, seed, budget), "floor"])
         return name
 
     @property
@@ -188,38 +198,37 @@ class Comparison(Question):
 
     def _learnt_in(self, planner: str, seed: int, budget: int) -> float:
         """Wall time that a planner learnt for, simulating left out [s]."""
-        own = float(self.stages.results[f"plans_{seed}_{budget}"][planner]["seconds"])
+        own = float(self.stages.results[f"plan_{planner}_{seed}_{budget}"]["seconds"])
         return own + (0.0 if planner == "nearest" else self.stages.seconds[f"net_{seed}_{budget}"])
 
-    @property
-    def planning(self) -> dict[str, Any]:
-        """What plans depend on besides nets and targets."""
+    def _own_settings(self, planner: str) -> dict[str, Any]:
+        """What plans depend on besides nets, hops and targets."""
         config = self.config
-        return {
-            "inverse": asdict(config.inverse),
-            "tandem": asdict(config.tandem),
-            "search": config.search,
-            "version": PLANNERS_VERSION,
+        own: dict[str, dict[str, Any]] = {
+            "nearest": {},
+            "single": {"inverse": asdict(config.inverse)},
+            "ensemble": {"inverse": asdict(config.inverse)},
+            "tandem": {"tandem": asdict(config.tandem)},
+            "cma": {"search": config.search},
         }
-
-    def _planned(self, stage: str, name: str) -> Results:
-        return self.stages.results[stage][name]
+        return own[planner]
 
     @property
     def names(self) -> list[str]:
         """Planners that can run here."""
         return [name for name in PLANNERS if name != "cma" or find_spec("cma")]
 
-    def _try(self, method: str, stage: str, make: Callable[[Any], Planner], seed: int, budget: int) -> None:
-        """Answers of a planner that tries hops, and their score."""
-        name, plans = f"{stage}_{seed}_{budget}", f"plans_{seed}_{budget}"
+    def _try(
+        self, stage: str, make: Callable[[Any], Planner], settings: dict[str, Any], plan: str, seed: int, budget: int
+    ) -> str:
+        """Answers of a planner that tries hops, begun as ``plan`` says; returns their stage."""
+        name = f"{stage}_{seed}_{budget}"
 
         def work() -> Results:
             return {"stretches": make(self.fitted(seed, budget)).predict(self.targets)[0].tolist()}
 
-        self.stages.run(name, self.trying_settings(method), work, needs=[plans])
-        seconds = self._learnt_in(begins_from(method), seed, budget)
-        self.score(method, seed, budget, name, lambda: self.stages.results[name], seconds=seconds)
+        self.stages.run(name, settings, work, needs=[plan])
+        return name
 
     def _best(self, fitted: Any, tries: int) -> Planner:
         return BestOfPlanner(fitted.inverse, self.hops.land, tries)
@@ -234,7 +243,7 @@ class Comparison(Question):
         if not self.config.oracle or not find_spec("cma") or ORACLE in self.scores.methods:
             return
         budget = max(self.config.budgets)
-        net = self._learn(0, budget)
+        hops = self._basis("nearest", 0, budget)
 
         def work() -> Results:
             before = self.hops.calls
@@ -242,7 +251,7 @@ class Comparison(Question):
             return {"stretches": stretches.tolist(), "calls_per_answer": (self.hops.calls - before) / len(self.targets)}
 
         settings = {"search": asdict(self._search), "images": True, "targets": self.targets.tolist()}
-        found = self.stages.run(ORACLE, settings, work, needs=[net])
+        found = self.stages.run(ORACLE, settings, work, needs=[hops])
         calls = found["calls_per_answer"]
         self.score(ORACLE, 0, budget, ORACLE, lambda: found, seconds=0.0, calls_per_answer=calls)
 

@@ -103,8 +103,8 @@ class VariedComparison(Comparison):
         alike = np.array(found["distances"]) * np.array(found["likeness"])[:, None]
         return float(np.sqrt(np.mean(np.square(alike)) / 2))
 
-    def _fit(self, net: HopNet, data: HopData, seed: int) -> VariedFitted:
-        return VariedFitted(net, data, self.config, seed, self)
+    def _fit(self, load: Callable[[], HopNet], data: HopData, seed: int) -> VariedFitted:
+        return VariedFitted(load, data, self.config, seed, self)
 
     def land(self, stretches: Floats, values: Floats) -> Floats:
         """Landings as they would be on Earth (n, 2) [m], of stretches (n, n_actuators) in scenes of ``values`` (n, k) [SI]."""
@@ -132,13 +132,24 @@ class VariedComparison(Comparison):
 class VariedFitted:
     """As ``Fitted``: planners of scenes that vary, made, when they are asked for, from hops and the net trained on them."""
 
-    def __init__(self, net: HopNet, data: HopData, config: CompareConfig, seed: int, comparison: VariedComparison) -> None:
-        self.net, self.data, self.config, self.seed = net, data.rows(data.usable), config, seed
+    def __init__(
+        self, load: Callable[[], HopNet], data: HopData, config: CompareConfig, seed: int, comparison: VariedComparison
+    ) -> None:
+        self._load, self.data, self.config, self.seed = load, data.rows(data.usable), config, seed
         self.comparison, self.scenes = comparison, comparison.scenes
-        self.landing = FrozenLanding(net, self.scenes.observed)
         #: What making each planner took beyond simulating and the surrogate [s].
         self.seconds: dict[str, float] = {}
         self._made: dict[str, Any] = {}
+
+    @cached_property
+    def net(self) -> HopNet:
+        """The surrogate."""
+        return self._load()
+
+    @cached_property
+    def landing(self) -> FrozenLanding:
+        """Its members' landings, told the scene."""
+        return FrozenLanding(self.net, self.scenes.observed)
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._made:
@@ -172,7 +183,7 @@ class VariedFitted:
     def _stored(self) -> NearestVariedHops:
         data, scenes = self.data, self.scenes
         return NearestVariedHops(
-            data["stretches"], data["landing"], scene_values(data, scenes), scenes, images=self.net.landing_images
+            data["stretches"], data["landing"], scene_values(data, scenes), scenes, images=self.comparison.images
         )
 
     @property
