@@ -25,6 +25,12 @@ def shares(n: int, parts: int, lanes: int) -> list[tuple[int, int]]:
     return [(a, b) for a, b in pairwise(edges) if b > a]
 
 
+def dealt(order: np.ndarray, parts: int) -> np.ndarray:
+    """``order``, dealt to ``parts`` shares like cards: what it begins with is what each share begins with."""
+    parts = max(1, parts)
+    return np.concatenate([order[k::parts] for k in range(parts)])
+
+
 def run_shares(
     work: Callable[[int, int, np.ndarray], None], n: int, threads: int | None, lanes: int, progress: Progress | None
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tensegrity_gym.batch import Progress, run_shares, thread_count
+from tensegrity_gym.batch import Progress, dealt, run_shares, shares, thread_count
 from tensegrity_gym.core import records as rec
 from tensegrity_gym.core import rollout as kernel
 from tensegrity_gym.core.flight import fly_rigidly
@@ -183,10 +183,14 @@ def _roll_out(problem: Problem, stop: int, records: rec.HopRecords, threads: int
     n = len(records.status)
     count = 1 if n <= ALONE * thread_count(threads) else lane_count(dtype)
 
+    # what stores least stays on the ground longest: begun first, it leaves no lanes idle at the end
+    first_to_last = np.argsort(records.runaway_energy, kind="stable") if stop == rec.TAKEOFF else np.arange(n)
+    order = dealt(first_to_last, len(shares(n, thread_count(threads), count)))
+
     def work(first: int, last: int, counter: np.ndarray) -> None:
         lanes = hop_lanes(typed, count)
         kernel_lanes = without_lanes(lanes) if count == 1 else lanes
-        run(typed, ground, settings, typed.actuator_length, records, lanes, kernel_lanes, first, last, counter)
+        run(typed, ground, settings, typed.actuator_length, records, order, lanes, kernel_lanes, first, last, counter)
 
     run_shares(work, n, threads, count, progress)
 

@@ -32,6 +32,7 @@ from tensegrity_gym import (
     form_find,
     simulate,
 )
+from tensegrity_gym.batch import dealt, shares
 from tensegrity_gym.energies import centre_of_mass
 from tensegrity_gym.types import Ground
 
@@ -225,10 +226,14 @@ def test_momentum_and_angular_momentum_of_a_lattice_in_space(spin: float) -> Non
     assert losses[0] > 1.0  # joules: it did vibrate
 
 
-def test_a_hop_has_the_same_bits_whatever_runs_beside_it() -> None:
-    """Alone, in another order, over two threads, without frames; here for the first 0.15 s, take-off included."""
+@pytest.mark.parametrize("fidelity", ["paper", "flown"])
+def test_a_hop_has_the_same_bits_whatever_runs_beside_it(fidelity: str) -> None:
+    """Alone, in another order, over two threads, without frames; here for the first 0.15 s, take-off included.
+
+    Flown hops are begun in an order of their own, what stores least first.
+    """
     short, e = Scene(duration=0.15), equilibria()
-    whole = simulate(STRETCHES, scene=short, equilibria=e, threads=1, trajectory_rate=100.0)
+    whole = simulate(STRETCHES, scene=short, equilibria=e, threads=1, fidelity=fidelity, trajectory_rate=100.0)
     order = [5, 2, 7, 0, 1, 3, 4, 6] * 2
     runs = {
         "alone": ([3], 1),
@@ -236,10 +241,19 @@ def test_a_hop_has_the_same_bits_whatever_runs_beside_it() -> None:
         "two threads": (order, 2),
     }
     for name, (rows, threads) in runs.items():
-        r = simulate(STRETCHES[rows], scene=short, equilibria=subset(e, rows), threads=threads)
+        r = simulate(STRETCHES[rows], scene=short, equilibria=subset(e, rows), threads=threads, fidelity=fidelity)
         for field in ("rest", "rest_nodes", "apex", "takeoff_time", "takeoff_velocity", "end_time", "status", "steps"):
             np.testing.assert_array_equal(getattr(r, field), getattr(whole, field)[rows], err_msg=f"{name}: {field}")
         np.testing.assert_array_equal(r.energies[:, :, CONTACT:], whole.energies[rows][:, :, CONTACT:])
+
+
+@pytest.mark.parametrize(("n", "threads"), [(0, 2), (1, 2), (33, 1), (64, 2), (80, 3)])
+def test_shares_begin_with_what_the_order_begins_with(n: int, threads: int) -> None:
+    cut = shares(n, threads, 8)
+    order = dealt(np.arange(n), len(cut))
+    np.testing.assert_array_equal(np.sort(order), np.arange(n))
+    if n == 64:  # two equal shares
+        np.testing.assert_array_equal([order[first] for first, _ in cut], [0, 1])
 
 
 def test_a_queued_hop_starts_afresh_in_a_used_lane() -> None:

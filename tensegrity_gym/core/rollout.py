@@ -143,18 +143,20 @@ def verdict(settings, lanes, lane, records, hop, step, quiet, phase):
 
 
 @jit(forceinline=False)
-def next_hop(records, queue, last):
-    """First hop from ``queue`` on that has an equilibrium to start from; the others end where they would have started."""
-    while queue < last and records.status[queue] >= 0:
+def next_hop(records, order, queue, last):
+    """First place of ``order`` from ``queue`` on whose hop has an equilibrium to start from; the others end where they are."""
+    while queue < last and records.status[order[queue]] >= 0:
         for event in (TAKEOFF, TOUCHDOWN, END):
-            copy_state(records, queue, RELEASE, event)
+            copy_state(records, order[queue], RELEASE, event)
         queue += 1
     return queue
 
 
 @jit
-def rollout(forces, step_function, structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
-    """Run hops ``first`` to ``last`` of ``records`` from their release states in one thread's lanes.
+def rollout(
+    forces, step_function, structure, ground, settings, actuator_length, records, order, lanes, work, first, last, progress
+):
+    """Run hops ``order[first]`` to ``order[last - 1]`` of ``records`` from their release states in one thread's lanes.
 
     ``work`` is ``lanes``, or of a single lane the same memory without its axis: the steps then compute one lattice only.
     ``actuator_length`` [m], shape (n_actuators,), are the unlocked natural lengths; ``progress[0]`` counts ended hops.
@@ -172,12 +174,12 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
         for k in range(actuator_length.shape[0]):
             lanes.actuator_length[k, lane] = actuator_length[k]
         # idle lanes must hold a sane lattice too
-        load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[first, RELEASE], dt)
-        queue = next_hop(records, queue, last)
+        load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[order[first], RELEASE], dt)
+        queue = next_hop(records, order, queue, last)
         if queue < last:
-            load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[queue, RELEASE], dt)
-            hop[lane] = queue
-            phase[lane] = records.phase[queue]
+            hop[lane] = order[queue]
+            phase[lane] = records.phase[hop[lane]]
+            load_hop(forces, structure, ground, actuator_length, lanes, lane, records.state[hop[lane], RELEASE], dt)
             queue += 1
             running += 1
     while running > 0:
@@ -235,9 +237,9 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
             progress[0] += 1
             hop[lane] = -1
             running -= 1
-            queue = next_hop(records, queue, last)
+            queue = next_hop(records, order, queue, last)
             if queue < last:
-                hop[lane] = queue
+                hop[lane] = order[queue]
                 queue += 1
                 running += 1
                 step[lane] = 0
@@ -248,7 +250,7 @@ def rollout(forces, step_function, structure, ground, settings, actuator_length,
 
 
 @jit(cache=True)
-def rollout_symplectic_euler(structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
+def rollout_symplectic_euler(structure, ground, settings, actuator_length, records, order, lanes, work, first, last, progress):
     """:func:`rollout` of the lattice by symplectic Euler, compiled once and cached."""
     rollout(
         lattice_forces,
@@ -258,6 +260,7 @@ def rollout_symplectic_euler(structure, ground, settings, actuator_length, recor
         settings,
         actuator_length,
         records,
+        order,
         lanes,
         work,
         first,
@@ -267,7 +270,7 @@ def rollout_symplectic_euler(structure, ground, settings, actuator_length, recor
 
 
 @jit(cache=True)
-def rollout_velocity_verlet(structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
+def rollout_velocity_verlet(structure, ground, settings, actuator_length, records, order, lanes, work, first, last, progress):
     """:func:`rollout` of the lattice by velocity Verlet, compiled once and cached."""
     rollout(
         lattice_forces,
@@ -277,6 +280,7 @@ def rollout_velocity_verlet(structure, ground, settings, actuator_length, record
         settings,
         actuator_length,
         records,
+        order,
         lanes,
         work,
         first,
@@ -286,7 +290,7 @@ def rollout_velocity_verlet(structure, ground, settings, actuator_length, record
 
 
 @jit(cache=True)
-def rollout_runge_kutta(structure, ground, settings, actuator_length, records, lanes, work, first, last, progress):
+def rollout_runge_kutta(structure, ground, settings, actuator_length, records, order, lanes, work, first, last, progress):
     """:func:`rollout` of the lattice by the classical Runge-Kutta method, compiled once and cached."""
     rollout(
         lattice_forces,
@@ -296,6 +300,7 @@ def rollout_runge_kutta(structure, ground, settings, actuator_length, records, l
         settings,
         actuator_length,
         records,
+        order,
         lanes,
         work,
         first,
