@@ -77,6 +77,10 @@ def test_what_others_have_added_meanwhile_stays_and_what_is_stale_does_not_come_
     stale.drop("sac")
     stale.write(path)
     assert Scores.read(path, TASK).methods == ["oracle", "td3"]
+    assert set(Scores.read(path, TASK).latencies) == {"sac"}  # has settings of its own
+    stale.drop_latency("sac")
+    stale.write(path)
+    assert Scores.read(path, TASK).latencies == {}
     filled().write(path, anew=True)
     assert Scores.read(path, TASK).lines == filled().lines
 

@@ -55,7 +55,7 @@ class Comparison(Question):
                 self.stages.say(f"{method}: {gone} kept scores were made with other settings, left out")
         for method, found in list(self.scores.latencies.items()):
             if found.settings != latency.settings_of(self, method):
-                del self.scores.latencies[method]
+                self.scores.drop_latency(method)
                 self.stages.say(f"{method}: its kept latency was measured with other settings, left out")
 
     def run(self) -> None:

@@ -73,7 +73,7 @@ class Scores:
         self.floor: float | None = None
         self.latencies: dict[str, Latency] = {}
         self.lines: dict[Key, Line] = {}
-        #: Methods and settings that were dropped, not to come back from a file.
+        #: Methods and settings whose scores or latencies were dropped, not to come back from a file.
         self._dropped: set[tuple[str, str]] = set()
 
     def settings(self, method: str) -> str | None:
@@ -96,6 +96,10 @@ class Scores:
         gone = [key for key in self.lines if key[0] == method]
         self._dropped |= {(method, self.lines.pop(key).settings) for key in gone}
         return len(gone)
+
+    def drop_latency(self, method: str) -> None:
+        """Leave a method's latency out."""
+        self._dropped.add((method, self.latencies.pop(method).settings))
 
     def of(self, method: str, budget: int) -> list[Line]:
         """Scores of all seeds of a method and budget, by seed."""
@@ -127,7 +131,9 @@ class Scores:
             known = key in self.lines or (line.method, line.settings) in self._dropped
             if not known and self.settings(line.method) in (None, line.settings):
                 self.lines[key] = line
-        self.latencies = others.latencies | self.latencies
+        for method, latency in others.latencies.items():
+            if (method, latency.settings) not in self._dropped:
+                self.latencies.setdefault(method, latency)
         self.floor = others.floor if self.floor is None else self.floor
 
     @classmethod
