@@ -22,7 +22,7 @@ from tensegrity_gym.task import reach
 from training.compare.config import CompareConfig
 from training.compare.run import Comparison
 from training.compare.statistics import interquartile_mean
-from training.inverse import InversePlanner
+from training.inverse import START_SEED, InversePlanner
 from training.score import distances
 
 #: The planner that prefers no answer for the energy that it stores.
@@ -89,7 +89,7 @@ def main(config: CompareConfig) -> None:
                 energy=None if name == LEAST_ERROR else usual.energy,
                 stored=stored,
                 images=fitted.net.landing_images,
-                seed=seed,
+                seed=seed + START_SEED,
             )
             stretches = planner.predict(inside)[0]
             landings = comparison.hops.perturbed(stretches, config.perturbations)[:, 1:]

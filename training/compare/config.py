@@ -88,7 +88,7 @@ class CompareConfig:
     """Go on from the scores in docs/scores of the working directory, running only what they lack, and write all scores there,
     tables and figures into docs/results.md, docs/images and README.md."""
     anew: bool = False
-    """With --write: begin without the scores in docs/scores, which are then overwritten."""
+    """Overwrite the scores in --out, with --write those in docs/scores too, and go on from none."""
     quick: bool = False
     """A run of under a minute, with hops cut off after 0.06 s, that shows that all works, and nothing else."""
     progress: bool = True
@@ -99,10 +99,6 @@ class CompareConfig:
             raise InvalidParameterError(
                 "write: expected it without --quick, got both: hops cut off after 0.06 s would overwrite the measured results in "
                 "README.md and docs; leave one of them out"
-            )
-        if self.anew and not self.write:
-            raise InvalidParameterError(
-                "anew: expected it with --write, without which no kept scores are gone on from; leave it out"
             )
         if self.second and self.write:
             raise InvalidParameterError("write: expected the first targets, which the tables are of, got second; leave one out")

@@ -20,6 +20,7 @@ from training.compare.config import CompareConfig
 from training.compare.learn import Fitted, fit_net
 from training.compare.methods import BAYESIAN, ORACLE, PLANNERS, PLANNERS_VERSION, REFINED, answer_calls, begins_from
 from training.compare.question import Question
+from training.compare.scores import Scores
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.planner import BestOfPlanner, Planner
 from training.refine import RefiningPlanner
@@ -287,10 +288,13 @@ def main(config: CompareConfig) -> None:
     if config.quick:
         config = config.shortened()
     comparison = comparison_of(config)
+    folder = comparison.stages.folder
+    path = folder / "scores.jsonl"
+    if not config.anew:
+        Scores.read(path, comparison.task)  # scores of another task are refused before hours of work, not after
     comparison.run()
     outcome = Outcome(comparison)
-    folder = comparison.stages.folder
-    comparison.scores.write(folder / "scores.jsonl")
+    comparison.scores.write(path, anew=config.anew)
     report.write_all(outcome, folder / "results.md", folder)
     if config.write:
         comparison.scores.write(config.kept_path, anew=config.anew)
