@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tensegrity_gym import MODEL_VERSION
-from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.errors import DataFileError
 from training.compare import report, run
 from training.compare.config import CompareConfig
 from training.compare.results import Outcome
