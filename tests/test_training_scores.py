@@ -173,8 +173,8 @@ def test_kept_scores_are_gone_on_from_in_another_folder(tmp_path: Path, monkeypa
         run.comparison_of(small("eighth", perturbations=3))
     assert not run.comparison_of(small("eighth", perturbations=3, anew=True)).scores.lines
     # in --out as well, and before any work
-    with pytest.raises(DataFileError, match=r"third/quick/scores\.jsonl: expected scores with perturbations 3, got 2.*--anew"):
-        run.main(small("third", perturbations=3, write=False))
+    with pytest.raises(DataFileError, match=r"first/quick/scores\.jsonl: expected scores with perturbations 3, got 2.*--anew"):
+        run.main(small("first", perturbations=3, write=False))
 
 
 def test_other_settings_replace_what_they_make_stale_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
