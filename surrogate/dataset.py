@@ -57,6 +57,8 @@ __all__ = [
 ]
 
 SEAL_BYTES = 512
+#: What to do about a damaged file: a run to the same name would go on from it, and be refused.
+AGAIN = "move it out of the way and generate it again"
 #: Parts of the configuration that are root attributes of their own, as JSON.
 PARTS = ("design", "scene", "fidelity")
 
@@ -143,7 +145,7 @@ def read(
             raise DataFileError(f"{path}: expected columns out of {list(schema)}, asked for {unknown}")
         missing = sorted(set(schema) - set(file))
         if missing:
-            raise DataFileError(f"{path}: expected the columns {sorted(schema)}, missing {missing}; generate it again")
+            raise DataFileError(f"{path}: expected the columns {sorted(schema)}, missing {missing}; {AGAIN}")
         hops = len(file["index"])
         found = {name: _column(path, file, name, schema[name], hops, configuration) for name in wanted}
         if columns is None:
@@ -201,13 +203,13 @@ class opened:
             raise DataFileError(self._damaged(error)) from error
 
     def _damaged(self, error: BaseException) -> str:
-        return f"{self.path}: expected a whole HDF5 file of hops, but it cannot be read ({error}); generate it again"
+        return f"{self.path}: expected a whole HDF5 file of hops, but it cannot be read ({error}); {AGAIN}"
 
 
 def _configuration(path: Path, file: h5py.File) -> dict[str, Any]:
     version = int(file.attrs.get("schema_version", -1))
     if version != SCHEMA_VERSION:
-        fix = "a newer version of this package made it: upgrade" if version > SCHEMA_VERSION else "generate anew"
+        fix = "a newer version of this package made it: upgrade" if version > SCHEMA_VERSION else AGAIN
         raise DataFileError(
             f"{path}: expected a hop file of schema {SCHEMA_VERSION}, got {version if version >= 0 else None}; {fix}"
         )
@@ -216,9 +218,7 @@ def _configuration(path: Path, file: h5py.File) -> dict[str, Any]:
         columns_of(configuration)
         expected_shape(COLUMNS["stretches"], 0, configuration)
     except (KeyError, TypeError, ValueError) as error:
-        raise DataFileError(
-            f"{path}: expected its configuration as JSON among its attributes ({error}); generate it again"
-        ) from error
+        raise DataFileError(f"{path}: expected its configuration as JSON among its attributes ({error}); {AGAIN}") from error
     _expect(path, "configuration hash", file.attrs.get("configuration_hash"), hash_of(configuration))
     return configuration
 
@@ -230,7 +230,7 @@ def _column(path: Path, file: h5py.File, name: str, column: Column, hops: int, c
     shape = expected_shape(column, hops, configuration, frames)
     if stored.shape != shape or stored.dtype != np.dtype(column.dtype):
         came = f"{stored.dtype}{stored.shape}"
-        raise DataFileError(f"{path}: expected column {name} as {column.dtype}{shape}, got {came}; generate it again")
+        raise DataFileError(f"{path}: expected column {name} as {column.dtype}{shape}, got {came}; {AGAIN}")
     values = stored[()].astype(np.dtype(column.dtype), copy=False)
     sums, kept = checksums(values, column), file[f"{CHECKSUMS}/{name}"][()]
     if not np.array_equal(sums, kept):
@@ -238,11 +238,11 @@ def _column(path: Path, file: h5py.File, name: str, column: Column, hops: int, c
         bad = np.flatnonzero(sums != kept)[:8].tolist() if len(sums) == len(kept) else "of another number"
         raise DataFileError(
             f"{path}: column {name}: checksum of chunks {bad} (of {rows} rows each) does not match what was written: damaged; "
-            "generate it again"
+            f"{AGAIN}"
         )
     return values
 
 
 def _expect(path: Path, what: str, kept: Any, came: str) -> None:
     if kept != came:
-        raise DataFileError(f"{path}: expected {what} {kept}, got {came}: damaged; generate it again")
+        raise DataFileError(f"{path}: expected {what} {kept}, got {came}: damaged; {AGAIN}")

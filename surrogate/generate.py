@@ -16,7 +16,7 @@ from tqdm import tqdm
 from surrogate import dataset
 from surrogate.chunks import Task, run_chunk
 from surrogate.hops import Configuration, HopData
-from surrogate.join import Piece, join, pieces_of
+from surrogate.join import Piece, join, pieces_of, runs, skipped_of
 from surrogate.sampling import read_stretches, sample_size, sample_stretches, stretches_hash
 from surrogate.schedule import Outcome, run_here, run_on_cluster
 from surrogate.storage import beside_data, ensure_folder, remove_partials, writer_lock
@@ -155,7 +155,9 @@ def fill(
                     outcomes = run_on_cluster(tasks, work, scheduler, workers, retries, bar.update)
                 have += _commit_all(folder, outcomes, configuration, skipped, bar)
         if have and (lacking or len(have) > len(known)):  # parts may be there, of a larger run, where none is lacking
-            dataset.write_blocks(path, configuration.as_dict(), join(have), skipped)
+            tried = [Piece(path, a, b, 0, 0) for a, b in lacking]  # what failed of these is in ``skipped``
+            before = skipped_of([path] if path.exists() else [], [*have, *tried])
+            dataset.write_blocks(path, configuration.as_dict(), join(have), [*before, *skipped])
         shutil.rmtree(folder, ignore_errors=True)
     if skipped:
         lines = "; ".join(f"hops {s['first']} to {s['last'] - 1}: {s['error']}" for s in skipped[:5])
@@ -191,9 +193,7 @@ def _lacking(have: Sequence[Piece], start: int, stop: int, chunk: int) -> Iterat
     for first in range(start // chunk * chunk, stop, chunk):
         numbers = np.arange(max(first, start), min(first + chunk, stop))
         missing = numbers[~there[numbers - start]]
-        for run in np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1):
-            if len(run):
-                yield int(run[0]), int(run[-1]) + 1
+        yield from runs(missing)
 
 
 def _commit_all(
@@ -226,9 +226,14 @@ def configuration_of(config: GenerateConfig) -> tuple[Configuration, Floats | No
         if config.stretches is None:
             raise InvalidParameterError("sampler: expected --stretches FILE with --sampler file")
         stretches = read_stretches(config.stretches, lattice.n_cells)
+    if sampler == "lhs" and config.first:
+        raise InvalidParameterError(
+            f"first: expected 0 with --sampler lhs, got {config.first}: a hypercube of another number of points is "
+            "another one, and shards of it cannot be merged; take --sampler sobol, or stretches from a file"
+        )
     default = {"grid": config.grid**lattice.n_cells, "file": 0 if stretches is None else len(stretches)}.get(sampler, 10_000)
     hops = default - (config.first if sampler in ("grid", "file") else 0) if config.hops is None else config.hops
-    size = {"lhs": config.first + hops, "grid": config.grid, "file": default}.get(sampler, 0)
+    size = {"lhs": hops, "grid": config.grid, "file": default}.get(sampler, 0)
     scene = Scene.preset(config.scene, **changes)
     configuration = Configuration(
         design=config.design,

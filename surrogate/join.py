@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,25 @@ def pieces_of(paths: Sequence[Path], configuration: Configuration | None = None)
             if b > a:
                 pieces.append(Piece(Path(path), int(index[a]), int(index[b - 1]) + 1, a, b))
     return pieces
+
+
+def skipped_of(paths: Sequence[Path], pieces: Sequence[Piece]) -> list[dict[str, Any]]:
+    """Chunks that files note as skipped, as far as no piece holds their hops."""
+    missing = []
+    for path in paths:
+        for note in json.loads(dataset.attributes(path).get("skipped", "[]")):
+            hops = np.arange(note["first"], note["last"])
+            held = np.any([(piece.first <= hops) & (hops < piece.last) for piece in pieces], axis=0)
+            for a, b in runs(hops[~held]):
+                missing.append(note | {"first": a, "last": b})
+    return missing
+
+
+def runs(numbers: np.ndarray) -> Iterator[tuple[int, int]]:
+    """First and last (excluded) of each run without gaps in ascending ``numbers``."""
+    for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1):
+        if len(run):
+            yield int(run[0]), int(run[-1]) + 1
 
 
 def join(pieces: Sequence[Piece], rows: int = 16 * 1024) -> Iterator[HopData]:

@@ -10,7 +10,7 @@ import tyro
 
 from surrogate import dataset
 from surrogate.hops import check_configuration
-from surrogate.join import join, pieces_of
+from surrogate.join import join, pieces_of, skipped_of
 from surrogate.storage import ensure_folder, writer_lock
 from tensegrity_gym.errors import DataFileError
 
@@ -37,7 +37,8 @@ def merge(out: Path | str, shards: list[Path]) -> Path:
     for shard in shards[1:]:
         check_configuration(dataset.attributes(shard)["configuration"], configuration, str(shard))
     with writer_lock(out):
-        return dataset.write_blocks(out, configuration, join(pieces_of(shards)))
+        pieces = pieces_of(shards)
+        return dataset.write_blocks(out, configuration, join(pieces), skipped_of(shards, pieces))
 
 
 def main(config: MergeConfig) -> None:

@@ -351,7 +351,7 @@ def load(path: Path | str) -> tuple[HopNet, dict[str, Any]]:
     InvalidParameterError for the name of a file that lies beside one.
     """
     path = Path(path)
-    card = read_json(beside(path, CARD))
+    card = read_json(beside(path, CARD), fix="train it again")
     expected = {"format": FORMAT, "model_version": MODEL_VERSION, "outputs": [o.name for o in OUTPUTS]}
     for name, value in expected.items():
         came = card.get(name) if isinstance(card, dict) else None

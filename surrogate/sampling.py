@@ -70,7 +70,9 @@ def read_stretches(path: Path | str, n_actuators: int = 4) -> Floats:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # which is said below, by name
             values = (
-                np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter="," if path.suffix == ".csv" else None)
+                np.load(path)
+                if path.suffix == ".npy"
+                else np.loadtxt(path, delimiter="," if path.suffix == ".csv" else None, ndmin=2)
             )
         values = np.atleast_2d(np.asarray(values, dtype=np.float64))
     except (OSError, ValueError, EOFError) as error:

@@ -131,14 +131,14 @@ def write_json(path: Path | str, content: Any) -> None:
         temporary.write_text(json.dumps(content, indent=1, allow_nan=True) + "\n", encoding="utf-8")
 
 
-def read_json(path: Path | str) -> Any:
-    """Read JSON; DataFileError when the file is missing or damaged."""
+def read_json(path: Path | str, *, fix: str = "delete it to have it made again") -> Any:
+    """Read JSON; DataFileError when the file is missing, or damaged, which ``fix`` says what to do about."""
     if not Path(path).exists():
         raise DataFileError(f"expected a readable JSON file at {path}, found none; see whether the name is right")
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise DataFileError(f"expected a readable JSON file at {path}: {error}; delete it to have it made again") from error
+        raise DataFileError(f"expected a readable JSON file at {path}: {error}; {fix}") from error
 
 
 def write_sealed(path: Path | str, content: bytes) -> None:

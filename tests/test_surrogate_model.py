@@ -161,7 +161,7 @@ def test_checkpoint_round_trip_and_refusals(tmp_path: Path) -> None:
             model.load(path)
     path.write_bytes(whole)
     foreign = whole_card.replace(f'"model_version": "{card["configuration"]["model_version"]}"', '"model_version": "other"')
-    for text, named in ((foreign, "'other'"), ("{}", "format"), ("[]", "format"), ("{", "readable JSON")):
+    for text, named in ((foreign, "'other'"), ("{}", "format"), ("[]", "format"), ("{", "readable JSON.*train it again")):
         path.with_suffix(".json").write_text(text)
         with pytest.raises(DataFileError, match=named):
             model.load(path)

@@ -81,6 +81,9 @@ def test_files_without_stretches_or_of_another_shape_are_named(tmp_path: Path) -
         np.save(tmp_path / "bad.npy", np.full(shape, 0.5))
         with pytest.raises(DataFileError, match=r"expected \(n, 4\) stretches.*got shape .*; reshape"):
             read_stretches(tmp_path / "bad.npy")
+    (tmp_path / "column.txt").write_text("0.3\n0.4\n0.5\n0.6\n")  # four hops of one stretch each, not one of four
+    with pytest.raises(DataFileError, match=r"got shape \(4, 1\)"):
+        read_stretches(tmp_path / "column.txt")
     np.save(tmp_path / "one.npy", np.full(4, 0.5))
     assert read_stretches(tmp_path / "one.npy").shape == (1, 4)
 
@@ -157,3 +160,10 @@ def test_centre_trajectory_starts_at_the_start(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(data["frame_times"][0, :frames]), 0.01, rtol=0.1)
     assert np.abs(data["trajectory"][0, 0, :2]).max() < 1e-3
     assert check(tmp_path / "hops.h5") == []
+
+
+def test_shards_of_a_hypercube_are_refused() -> None:
+    """Hops 50 to 99 would be those of a hypercube of 100 points, and nothing to put beside one of 50."""
+    assert configuration_of(GenerateConfig(Path("hops.h5"), hops=50, sampler="lhs"))[0].sampler_size == 50
+    with pytest.raises(InvalidParameterError, match="first: expected 0 with --sampler lhs, got 50"):
+        configuration_of(GenerateConfig(Path("hops.h5"), hops=50, first=50, sampler="lhs"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import resource
@@ -21,6 +22,7 @@ import pytest
 from surrogate import chunks, dataset, generate
 from surrogate.check import check
 from surrogate.dataset import Configuration
+from surrogate.merge import merge
 from surrogate.storage import writer_lock
 from tensegrity_gym import Scene
 from tensegrity_gym.errors import DataFileError, FileInUseError, OutputFolderError, SkippedChunksError
@@ -255,7 +257,13 @@ def test_poison_chunk_is_skipped_named_and_tried_again(tmp_path: Path, monkeypat
     assert check(path) == []
     assert dataset.read(path)["index"].tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
     assert '"first": 4' in dataset.attributes(path)["skipped"]
+    generate.fill(path, 2, CONFIGURATION, first=12, progress=False)  # grown, and merged, it still says what it lacks, and why
+    generate.fill(tmp_path / "more.h5", 2, CONFIGURATION, first=14, progress=False)
+    for file in (path, merge(tmp_path / "all.h5", [path, tmp_path / "more.h5"])):
+        assert [(note["first"], note["last"]) for note in json.loads(dataset.attributes(file)["skipped"])] == [(4, 8)]
     monkeypatch.setattr(chunks, "simulate", _simulate)
+    generate.fill(path, 2, CONFIGURATION, first=4, progress=False)
+    assert [(note["first"], note["last"]) for note in json.loads(dataset.attributes(path)["skipped"])] == [(6, 8)]
     data = generate.generate(path, 12, CONFIGURATION, chunk=4, progress=False)
     assert data.digest == generate.generate(tmp_path / "whole.h5", 12, CONFIGURATION, progress=False).digest
     assert dataset.attributes(path)["skipped"] == "[]"

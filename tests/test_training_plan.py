@@ -217,6 +217,8 @@ def test_hops_of_scenes_that_vary_are_planned_in_the_one_asked_for(tmp_path: Pat
     net, card = train(alike, replace(QUICK, net=NetConfig(hidden=(32, 32), members=2), epochs=300), progress=False)
     answers = varied_planner_of(net, card, alike, config=POOL).predict(seen)[0]  # asked in metres all the same
     assert np.linalg.norm(real(answers) * 4.0 / seen[:, 2:3] - seen[:, :2], axis=1).max() < 0.02
+    with pytest.raises(InvalidParameterError, match="varied_planner_of"):
+        planner_of(net, card, alike, at={"friction": 0.5, "gravity": 3.0})
     with pytest.raises(DataFileError, match="expected lengths 'as on Earth'"):  # a net of the comparison, and a file in metres
         planner_of(net, card, data, at={"friction": 0.5, "gravity": 3.0})
     tilted = replace(VARYING, scene_ranges={"restitution": (0.0, 0.5)})

@@ -20,7 +20,7 @@ from surrogate.model import HopNet, NetConfig, scene_symmetries
 from tensegrity_gym import Lattice, Scene
 from tensegrity_gym.errors import DataFileError, InvalidParameterError
 from tensegrity_gym.scene_ranges import scene_ranges
-from training import refine
+from training import inverse, refine
 from training.evolution import EvolutionConfig, EvolutionPlanner
 from training.hops import Hops
 from training.inverse import InverseConfig, InversePlanner, fit_energy
@@ -131,6 +131,17 @@ def test_same_question_same_answer_and_single_or_batch() -> None:
     assert single.shape == (4,)
     assert state is None
     np.testing.assert_allclose(single, batch[0], atol=1e-4)
+
+
+def test_answers_are_the_same_whatever_the_size_of_the_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    planner = InversePlanner(arm)
+    targets = arm(torch.from_numpy(sample_stretches(11, 5).astype(np.float32)))[0].numpy()
+    whole, proposed = planner.plan(targets), planner.propose(targets, 3)
+    monkeypatch.setattr(inverse, "BLOCK", 4)
+    for part, wanted in zip(planner.plan(targets), whole, strict=True):
+        # products of matrices of another shape may round otherwise, and descents end where float32 does
+        np.testing.assert_allclose(part, wanted, atol=1e-3)
+    assert planner.propose(targets, 3).shape == proposed.shape == (11, 3, 4)
 
 
 def test_of_equal_answers_the_one_that_stores_least_energy() -> None:
@@ -276,6 +287,9 @@ def test_actor_round_trip_and_refusals(tmp_path: Path) -> None:
         actor.predict(np.zeros(5))
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(DataFileError, match="checksum"):
+        ActorPolicy.load(path)
+    path.with_suffix(".json").write_text("{")
+    with pytest.raises(DataFileError, match=r"readable JSON.*train it again"):
         ActorPolicy.load(path)
     with pytest.raises(DataFileError, match="found none; see whether"):
         ActorPolicy.load(tmp_path / "absent.safetensors")

@@ -47,6 +47,17 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[PolicyConfig]:
     return asked
 
 
+def test_calls_that_some_settings_cannot_take_are_refused_before_the_first_training(
+    trained: list[PolicyConfig], tmp_path: Path
+) -> None:
+    """1030 hops go into rollouts of 10, enough for the committed 80 and too few for the 160 that a setting may ask for."""
+    config = TuneConfig(out=tmp_path, algorithm="ppo", calls=1030, settings=12, targets=8, progress=False)
+    assert {80, 160} <= {values["rollout"] for values in Search(config).values}
+    with pytest.raises(InvalidParameterError, match=r"rollouts of about 160 hops.*got 1030"):
+        Search(config).run()
+    assert trained == []
+
+
 def test_the_best_settings_win_the_final_and_lucky_ones_do_not(
     trained: list[PolicyConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -116,7 +116,17 @@ def test_nearest_of_many_scenes_weighs_what_a_scene_changes() -> None:
     np.testing.assert_array_equal(chosen, stretches[1])
 
 
-@pytest.mark.parametrize("bad", [np.zeros(2), np.array((np.nan, 0.0, 3.0, 0.5)), np.zeros((2, 5))])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros(2),
+        np.array((np.nan, 0.0, 3.0, 0.5)),
+        np.zeros((2, 5)),
+        np.array((0.1, 0.0, 0.5, 3.0)),  # gravity and friction the other way round
+        np.array((0.1, 0.0, -4.0, 0.5)),
+        np.array([(0.1, 0.0, 3.0, 0.5), (0.1, 0.0, 12.0, 0.5)]),
+    ],
+)
 def test_observations_without_their_scene_are_named(bad: np.ndarray) -> None:
     with pytest.raises(InvalidParameterError, match="gravity"):
         VariedPlanner(planner_of, VARIED, made_alike=True).predict(bad)

@@ -29,6 +29,9 @@ LEAST_EQUAL = 3e-5
 START_SEED = 2_000_003
 #: Proposals differ in some stretch by at least this [-].
 DISTINCT = 0.01
+#: Targets whose starts are chosen together: what is compared, targets times points of the pool, must fit into memory, and is
+#: 100 MB where 100 000 hops and their images are points.
+BLOCK = 64
 
 
 @dataclass(frozen=True)
@@ -164,10 +167,15 @@ class InversePlanner:
         shift, doubt = self.correction(stretches)
         return mean + shift, 2 * doubt
 
-    @one_thread()
-    @torch.no_grad()
     def _search(self, goal: Tensor, starts: int) -> tuple[Tensor, Tensor]:
         """Ends of the descents (n, starts, n_actuators) and their expected squares (n, starts) [m^2]."""
+        parts = [self._search_block(block, starts) for block in goal.split(BLOCK)]
+        found, cost = (torch.cat(part) for part in zip(*parts, strict=True))
+        return found, cost
+
+    @one_thread()
+    @torch.no_grad()
+    def _search_block(self, goal: Tensor, starts: int) -> tuple[Tensor, Tensor]:
         mean, variance = self.pool_seen
         aims = min(max(self.config.aims, starts), len(self.pool))
         first = (torch.cdist(goal, mean) ** 2 + variance).topk(aims, largest=False).indices

@@ -72,8 +72,14 @@ def planner_of(
         at: the scene to plan in, by name [SI units], for a net that was trained on hops of scenes that vary.
         floor: how far a landing moves, in each direction, when nothing but the unknowable changes [m].
 
-    Raises DataFileError for hops of another configuration, InvalidParameterError for a scene that the net does not know.
+    Raises DataFileError for hops of another configuration, InvalidParameterError for a scene that the net does not know, and for
+    hops whose lengths were made alike: :func:`varied_planner_of` plans with those.
     """
+    if "lengths" in data.configuration:
+        raise InvalidParameterError(
+            f"{where}: expected landings in metres of their own scene, got lengths {data.configuration['lengths']}; "
+            "take varied_planner_of, which asks and answers in metres"
+        )
     known, held, of_all = _known(net, card, data, seed, where)
     _check_scene(net, at)
     config = config or InverseConfig()

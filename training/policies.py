@@ -111,7 +111,7 @@ class ActorPolicy:
     def load(cls, path: Path | str) -> ActorPolicy:
         """Read a saved actor; DataFileError for a missing, damaged or foreign one."""
         path = Path(path)
-        card = read_json(beside(path, CARD))
+        card = read_json(beside(path, CARD), fix="train it again")
         for name, values in {"format": FORMATS, "model_version": (MODEL_VERSION,)}.items():
             came = card.get(name) if isinstance(card, dict) else None
             if came not in values:

@@ -22,6 +22,8 @@ from tensegrity_gym.types import Floats
 
 #: Gravity that lengths and times are brought to [m/s^2].
 EARTH = float(Scene.PRESETS["earth"]["gravity"])
+#: By how much of a range's greater end a scene value may lie beyond it: observations are float32.
+ROUNDING = 1e-6
 #: Columns of a data set that go as 1/g.
 BALLISTIC = ("landing", "touchdown", "rest", "apex", "flight_time")
 
@@ -36,7 +38,7 @@ def likeness(values: Floats, names: Sequence[str]) -> Floats:
 def alike(observations: ArrayLike, scenes: SceneRanges) -> tuple[Floats, Floats]:
     """Observations (2 + k,) or (n, 2 + k) to targets as they would be on Earth (n, 2) [m] and scene values (n, k) [SI].
 
-    InvalidParameterError for what is no observation of these scenes.
+    InvalidParameterError for what is no observation of these scenes, such as one of a scene beyond their ranges.
     """
     width = 2 + len(scenes.observed)
     rows = np.atleast_2d(np.asarray(observations, dtype=np.float64))
@@ -46,6 +48,15 @@ def alike(observations: ArrayLike, scenes: SceneRanges) -> tuple[Floats, Floats]
             f"got {observations!r}"
         )
     values = rows[:, 2:]
+    low, high = scenes.bounds()
+    away = ROUNDING * np.maximum(np.abs(low), np.abs(high))
+    strange = ((values < low - away) | (values > high + away)).any(axis=1)
+    if strange.any():
+        known = ", ".join(f"{name} from {a:g} to {b:g}" for name, a, b in zip(scenes.observed, low, high, strict=True))
+        raise InvalidParameterError(
+            f"observation: expected scene values in this order and these ranges: {known}, got {values[strange][0].tolist()}; "
+            f"put them in order, or learn from hops of such scenes"
+        )
     return rows[:, :2] * likeness(values, scenes.observed)[:, None], values
 
 

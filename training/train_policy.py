@@ -23,7 +23,7 @@ from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.scene_ranges import SceneRanges
 from tensegrity_gym.task import check_fidelity
 from training import checkpoint
-from training.algorithms import build, check_rollout, env_count, hyperparameters, updates_per_hop
+from training.algorithms import build, check_rollout, env_count, hyperparameters, rollout_of, updates_per_hop
 from training.policies import ActorPolicy
 from training.sb3_vec_env import ENV_SEEDS, BatchedHopVecEnv
 from training.similarity import Scaling
@@ -193,16 +193,16 @@ def train_policy(
 ) -> tuple[dict[int, ActorPolicy], dict[str, Any]]:
     """Train for ``config.calls`` hops; returns actors as they were after each of ``budgets`` hops, and a card.
 
-    The last actor, after all the hops, is always among them. ``state`` is a file from which a killed training goes on,
-    with the same bits; it stays there for the caller to remove when the actors are safely written. ``threads`` of the
-    simulator, None for all cores that this process may use, change no bit.
+    Training goes by rollouts (of one step of all envs, or PPO's): budgets are whole numbers of them. The last
+    actor, after all the hops, is always among the actors. ``state`` is a file from which a killed training goes on, with the
+    same bits; it stays there for the caller to remove when the actors are safely written. ``threads`` of the simulator, None for
+    all cores that this process may use, change no bit.
     """
-    if any(not 0 < b <= config.calls for b in budgets):
-        raise InvalidParameterError(f"budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}")
     scenes = scene if isinstance(scene, SceneRanges) else SceneRanges(scene)
     scaling, envs = Scaling.of(scenes), config.together
     symmetry = Symmetry.of(scenes) if config.symmetric else None
     values = check_calls(config)
+    _check_budgets(budgets, config, values)
     if config.updates is not None and "updates" in values:
         values |= {"updates": config.updates}
     plain, told = asdict(config) | {"hyperparameters": values}, asdict(scenes if scenes.ranges else scenes.base)
@@ -244,6 +244,19 @@ def check_calls(config: PolicyConfig) -> dict[str, Any]:
     if config.algorithm == "ppo":
         check_rollout(config.calls, values["rollout"], lambda calls: replace(config, calls=calls).together)
     return values
+
+
+def _check_budgets(budgets: Sequence[int], config: PolicyConfig, values: dict[str, Any]) -> None:
+    if any(not 0 < b <= config.calls for b in budgets):
+        raise InvalidParameterError(f"budgets: expected 1 <= budgets <= calls, got calls {config.calls}, budgets {list(budgets)}")
+    envs = config.together
+    rollout = rollout_of(config.calls, envs, values["rollout"]) if config.algorithm == "ppo" else envs
+    for budget in budgets:
+        if budget % rollout:  # the actor after the rollout has seen more hops than asked for, that before it fewer
+            raise InvalidParameterError(
+                f"budgets: expected multiples of {rollout}, the hops between two trainings of {config.algorithm} with {envs} "
+                f"envs, got {budget}; the nearest is {max(rollout, round(budget / rollout) * rollout)}"
+            )
 
 
 def _evaluation(

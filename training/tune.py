@@ -16,7 +16,7 @@ from surrogate.storage import atomic_path
 from tensegrity_gym import MODEL_VERSION
 from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.task import check_fidelity, reach, sample_targets
-from training.algorithms import FOLDER, hyperparameters
+from training.algorithms import FOLDER, check_rollout, hyperparameters
 from training.compare.statistics import interquartile_mean
 from training.compare.targets import SCENES, VARIED, scenes_of
 from training.hops import Hops
@@ -100,6 +100,9 @@ class Search:
     def run(self) -> tuple[list[Trial], list[Trial]]:
         """All trials, and those of the final, each from the best to the worst."""
         config = self.config
+        if config.algorithm == "ppo":  # one that cannot take so many calls would stop the search hours later
+            for rollout in {values["rollout"] for values in self.values}:
+                check_rollout(config.calls, rollout, lambda calls: PolicyConfig("ppo", calls=calls).together)
         tried = [self._trial(k, range(config.seeds)) for k in range(len(self.values))]
         tried.sort(key=lambda trial: trial.mean)
         numbers = {0, *(trial.number for trial in tried[: config.finalists])}
