@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +10,10 @@ import numpy as np
 from matplotlib.ticker import EngFormatter, FormatStrFormatter, LogLocator, NullFormatter
 
 from surrogate.dataset import HopData
-from surrogate.figures import COLOURS, STYLE, Figure, plt
+from surrogate.figures import COLOURS, STYLE, Figure, plt, write_png
 from surrogate.model import HopNet
 from surrogate.outputs import OUTPUTS, target_columns
 from surrogate.scores import PLANES, of_data
-from surrogate.storage import atomic_path
 
 if TYPE_CHECKING:
     from surrogate.evaluate import Evaluation
@@ -42,13 +40,7 @@ def draw(net: HopNet, rows: HopData, found: Evaluation, studies: Studies, folder
 
 def _save(make: Callable[[], Figure], path: Path) -> Path:
     with plt.rc_context(STYLE | {"figure.dpi": 100}):  # type: ignore[arg-type]
-        figure = make()
-        picture = io.BytesIO()
-        figure.savefig(picture, format="png", bbox_inches="tight")
-        plt.close(figure)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(picture.getvalue())
-    return path
+        return write_png(make(), path)
 
 
 def calibration(found: Evaluation) -> Figure:

@@ -196,10 +196,14 @@ VARIED: dict[str, tuple[Callable[[HopData], Figure], str]] = {
 def save(draw: Callable[[HopData], Figure], data: HopData, path: Path) -> Path:
     """Draw a picture into a PNG."""
     with plt.rc_context(STYLE):  # type: ignore[arg-type]
-        figure = draw(data)
-        picture = io.BytesIO()
-        figure.savefig(picture, format="png", bbox_inches="tight")
-        plt.close(figure)
+        return write_png(draw(data), path)
+
+
+def write_png(figure: Figure, path: Path, made_of: str | None = None) -> Path:
+    """Write a PNG atomically and close the figure; ``made_of`` tells, in its text "Source", what it shows."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", bbox_inches="tight", metadata=None if made_of is None else {"Source": made_of})
+    plt.close(figure)
     with atomic_path(path) as temporary:
         temporary.write_bytes(picture.getvalue())
     return path

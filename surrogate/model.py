@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
@@ -14,17 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from surrogate.hops import PHYSICS, check_parts
 from surrogate.outputs import LANDING, OUTPUTS, Output, scene_columns, target_columns
 from surrogate.schema import SCENE_VALUES
-from surrogate.storage import CARD, atomic_path, beside, ensure_folder, read_json, write_json
+from surrogate.weights import weights_at, write_weights
 from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE, Lattice, Scene
-from tensegrity_gym.errors import DataFileError, InvalidParameterError, InvalidStretchesError
+from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
 
 __all__ = [
     "OUTPUTS",
@@ -325,12 +320,6 @@ def _products(permutations: np.ndarray, signs: np.ndarray) -> np.ndarray:
 
 def save(net: HopNet, path: Path | str, card: dict[str, Any]) -> Path:
     """Write weights and normalisers to ``path`` (safetensors) and the card, with their checksum, to ``path`` .json."""
-    path = Path(path)
-    kept = beside(path, CARD)
-    ensure_folder(path.parent)
-    content = save_tensors({name: value.cpu().contiguous() for name, value in net.state_dict().items()})
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
     fixed = {
         "format": FORMAT,
         "model_version": MODEL_VERSION,
@@ -338,10 +327,8 @@ def save(net: HopNet, path: Path | str, card: dict[str, Any]) -> Path:
         "scene": asdict(net.scene),
         "scene_ranges": {name: list(bounds) for name, bounds in net.scene_ranges.items()},
         "outputs": [o.name for o in OUTPUTS],
-        "sha256": hashlib.sha256(content).hexdigest(),
     }
-    write_json(kept, card | fixed)
-    return path
+    return write_weights(path, net.state_dict(), card | fixed)
 
 
 def load(path: Path | str) -> tuple[HopNet, dict[str, Any]]:
@@ -350,24 +337,12 @@ def load(path: Path | str) -> tuple[HopNet, dict[str, Any]]:
     Raises DataFileError for a missing, damaged or foreign one (another format, or another version of the physics), and
     InvalidParameterError for the name of a file that lies beside one.
     """
-    path = Path(path)
-    card = read_json(beside(path, CARD), fix="train it again")
-    expected = {"format": FORMAT, "model_version": MODEL_VERSION, "outputs": [o.name for o in OUTPUTS]}
-    for name, value in expected.items():
-        came = card.get(name) if isinstance(card, dict) else None
-        if came != value:
-            raise DataFileError(f"{path}: expected a surrogate with {name} {value!r}, got {came!r}; train it again")
-    try:
-        content = path.read_bytes()
-        if hashlib.sha256(content).hexdigest() != card["sha256"]:
-            raise ValueError(f"its checksum is not {card['sha256']}, as the card says")
-        state = load_tensors(content)
+    expected = {"format": (FORMAT,), "model_version": (MODEL_VERSION,), "outputs": ([o.name for o in OUTPUTS],)}
+    with weights_at(path, "a surrogate", expected) as (state, card):
         size = NetConfig(**(card["net"] | {"hidden": tuple(card["net"]["hidden"])}))
         signs = state["signs"][:, LANDING]
         net = HopNet(size, state["permutations"].numpy(), signs.numpy(), Scene(**card["scene"]), card["scene_ranges"])
         net.load_state_dict(state)
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError, json.JSONDecodeError) as error:
-        raise DataFileError(f"{path}: expected a whole surrogate checkpoint ({error}); train it again") from error
     return net.eval(), card
 
 

@@ -14,11 +14,10 @@ matplotlib.use("Agg")  # no window
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 from PIL import Image
 
 from surrogate.dataset import HopData
-from surrogate.figures import COLOURS, STYLE
+from surrogate.figures import COLOURS, STYLE, write_png
 from surrogate.model import OUTPUTS, target_columns
 from surrogate.storage import atomic_path
 from tensegrity_gym import ENERGY_NAMES, HopResult, render
@@ -27,16 +26,6 @@ from training.score import Score
 
 def _style() -> AbstractContextManager[None]:
     return plt.rc_context(STYLE)  # type: ignore[arg-type]
-
-
-def save(figure: Figure, path: Path, made_of: str | None = None) -> Path:
-    """Write a PNG atomically and close the figure; ``made_of`` tells, in its text "Source", what it shows."""
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight", metadata=None if made_of is None else {"Source": made_of})
-    plt.close(figure)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(picture.getvalue())
-    return path
 
 
 def filmstrip(result: HopResult, path: Path) -> Path:
@@ -78,7 +67,7 @@ def energies(result: HopResult, path: Path) -> float:
                 )
         axes.set(xlabel="time since release [s]", ylabel="energy [J]", xlim=(0, times[-1]))
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-        save(figure, path)
+        write_png(figure, path)
     return closure
 
 
@@ -95,7 +84,7 @@ def landing_map(data: HopData, path: Path) -> Path:
             ax.set(title=f"{title}, {len(data)} hops", xlabel="x [m]", ylabel="y [m]")
             ax.set_aspect("equal", adjustable="datalim")
         figure.colorbar(marks, ax=axes, label="λ1 − λ2 + λ3 − λ4", shrink=0.9)
-        return save(figure, path)
+        return write_png(figure, path)
 
 
 def predicted_against_simulated(predicted: np.ndarray, held_out: HopData, path: Path) -> Path:
@@ -112,7 +101,7 @@ def predicted_against_simulated(predicted: np.ndarray, held_out: HopData, path: 
             error = np.sqrt(np.mean((predicted[known, k] - simulated[known, k]) ** 2)) if known.any() else float("nan")
             ax.set(title=f"{output.name.replace('_', ' ')}: RMSE {error:.3g} {output.unit}")
             ax.set(xlabel=f"simulated [{output.unit}]", ylabel=f"predicted [{output.unit}]")
-        return save(figure, path)
+        return write_png(figure, path)
 
 
 def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
@@ -132,7 +121,7 @@ def plans(targets: np.ndarray, scores: Mapping[str, Score], path: Path) -> Path:
             ax.title.set_fontsize(11)
         np.atleast_1d(axes)[0].set(ylabel="y [m]")
         np.atleast_1d(axes)[0].legend(loc="upper left", bbox_to_anchor=(0, 0), borderaxespad=4.5, fontsize=9)
-        return save(figure, path)
+        return write_png(figure, path)
 
 
 def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float, floor: float, path: Path) -> Path:
@@ -162,4 +151,4 @@ def error_against_calls(scores: Mapping[str, Mapping[int, Score]], reach: float,
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("")
         figure.legend(loc="outside lower center", ncols=2)
-        return save(figure, path)
+        return write_png(figure, path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -10,14 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 from torch import nn
 
-from surrogate.storage import CARD, atomic_path, beside, ensure_folder, read_json, write_json
+from surrogate.weights import weights_at, write_weights
 from tensegrity_gym import MODEL_VERSION, STRETCH_RANGE
-from tensegrity_gym.errors import DataFileError, InvalidParameterError
+from tensegrity_gym.errors import InvalidParameterError
 from training.planner import Prediction
 from training.similarity import Scaling
 from training.symmetry import Symmetry
@@ -90,37 +86,19 @@ class ActorPolicy:
 
     def save(self, path: Path | str, card: dict[str, Any]) -> Path:
         """Write weights (safetensors) and, beside them, the card with their checksum (.json)."""
-        path = Path(path)
-        kept = beside(path, CARD)
-        ensure_folder(path.parent)
-        content = save_tensors(self.layers.state_dict())
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(content)
         fixed = {
             "format": FORMAT,
             "model_version": MODEL_VERSION,
             "scaling": asdict(self.scaling),
             "squash": self.squash,
             "symmetry": None if self.symmetry is None else asdict(self.symmetry),
-            "sha256": hashlib.sha256(content).hexdigest(),
         }
-        write_json(kept, card | fixed)
-        return path
+        return write_weights(path, self.layers.state_dict(), card | fixed)
 
     @classmethod
     def load(cls, path: Path | str) -> ActorPolicy:
         """Read a saved actor; DataFileError for a missing, damaged or foreign one."""
-        path = Path(path)
-        card = read_json(beside(path, CARD), fix="train it again")
-        for name, values in {"format": FORMATS, "model_version": (MODEL_VERSION,)}.items():
-            came = card.get(name) if isinstance(card, dict) else None
-            if came not in values:
-                raise DataFileError(f"{path}: expected an actor with {name} {values[-1]!r}, got {came!r}; train it again")
-        try:
-            content = path.read_bytes()
-            if hashlib.sha256(content).hexdigest() != card["sha256"]:
-                raise ValueError(f"its checksum is not {card['sha256']}, as the card says")
-            state = load_tensors(content)
+        with weights_at(path, "an actor", {"format": FORMATS, "model_version": (MODEL_VERSION,)}) as (state, card):
             weights = [state[name] for name in sorted(state, key=lambda n: int(n.split(".")[0])) if name.endswith("weight")]
             layers = _mlp([weights[0].shape[1], *(w.shape[0] for w in weights)])
             layers.load_state_dict(state)
@@ -129,8 +107,6 @@ class ActorPolicy:
             kept, group = card["scaling"], card.get("symmetry")
             symmetry = group and Symmetry(tuple(map(tuple, group["permutations"])), tuple(map(tuple, group["signs"])))
             return cls(layers, Scaling(tuple(kept["scale"]), tuple(kept["offset"]), kept["gravity"]), card["squash"], symmetry)
-        except (OSError, ValueError, KeyError, IndexError, TypeError, RuntimeError, SafetensorError) as error:
-            raise DataFileError(f"{path}: expected a whole actor checkpoint ({error}); train it again") from error
 
 
 def _check_actor(model: Any, modules: list[nn.Module], squash: str) -> None:

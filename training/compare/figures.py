@@ -13,11 +13,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from surrogate.figures import COLOURS, STYLE
+from surrogate.figures import COLOURS, STYLE, write_png
 from training.compare.methods import label
 from training.compare.results import Outcome
 from training.compare.statistics import performance_profile
-from training.figures import save
 
 MARKERS = ("o", "s", "^", "v", "D", "P", "X", "<", ">", "*")
 
@@ -54,7 +53,7 @@ def sample_efficiency(outcome: Outcome, path: Path) -> Path:
         axes.set(xscale="log", yscale="log", xlabel="simulator calls learnt from", ylabel=f"landing error, IQM [{outcome.shown}]")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        return save(figure, path, outcome.all.digest)
+        return write_png(figure, path, outcome.all.digest)
 
 
 def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
@@ -72,7 +71,7 @@ def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
         )
         axes.xaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        return save(figure, path, outcome.all.digest)
+        return write_png(figure, path, outcome.all.digest)
 
 
 def pareto(outcome: Outcome, path: Path) -> Path:
@@ -95,4 +94,4 @@ def pareto(outcome: Outcome, path: Path) -> Path:
         )
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        return save(figure, path, outcome.all.digest)
+        return write_png(figure, path, outcome.all.digest)
