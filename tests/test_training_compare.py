@@ -25,8 +25,9 @@ from tensegrity_gym.task import TARGET_LIMIT, reach, reachable
 from training.compare import policies, report, run
 from training.compare import targets as registered
 from training.compare.config import CompareConfig
+from training.compare.figures import looks
 from training.compare.latency import question_times
-from training.compare.methods import PLANNERS
+from training.compare.methods import LABELS, PLANNERS
 from training.compare.results import Outcome
 from training.compare.scores import errors_and_scatter
 from training.compare.statistics import interquartile_mean, interval, performance_profile, probability_of_improvement
@@ -36,6 +37,14 @@ from training.policies import ActorPolicy
 from training.symmetry import Symmetry
 
 QUICK = Scene(duration=0.05)
+
+
+def test_no_two_methods_of_a_figure_look_alike() -> None:
+    """With all that may be in one: some have the same colour, and tell themselves apart by line and mark."""
+    methods = [*LABELS, "best8", "best32", "repeat4", "repeat8", "refine4", "refine8", "bayes8"]
+    drawn = looks(methods)
+    assert len({(look["color"], look["ls"]) for look in drawn.values()}) == len(methods)
+    assert len({(look["color"], look["marker"]) for look in drawn.values()}) == len(methods)
 
 
 def test_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:

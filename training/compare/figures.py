@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -14,19 +16,30 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from surrogate.figures import COLOURS, STYLE, write_png
-from training.compare.methods import label
+from training.compare.methods import algorithm_of, begins_from, label
 from training.compare.results import Outcome
 from training.compare.statistics import performance_profile
 
-MARKERS = ("o", "s", "^", "v", "D", "P", "X", "<", ">", "*")
+#: Colours, numbers of ``COLOURS``, by what answers rest on: methods that rest on the same are told apart by their lines.
+COLOUR_OF = {"nearest": 0, "ensemble": 5, "in turn": 1, "single": 3, "tandem": 3, "cma": 3, "sac": 2, "td3": 6, "ppo": 4}
+LINES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"), ((0, (5, 1, 1, 1, 1, 1)), "v"))
 
 
 def _style() -> AbstractContextManager[None]:
     return plt.rc_context(STYLE | {"figure.dpi": 95})  # type: ignore[arg-type]
 
 
-def _look(k: int) -> dict[str, object]:
-    return {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "ls": "-" if k < len(COLOURS) else "--"}
+def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour, line and marker of each method: no two are alike."""
+    found: dict[str, dict[str, Any]] = {}
+    used: dict[str, int] = {}
+    for method in methods:
+        in_turn = begins_from(method) == "ensemble" and not method.startswith(("ensemble", "best"))
+        colour = COLOURS[COLOUR_OF["in turn" if in_turn else begins_from(algorithm_of(method)[0])]]
+        line, marker = LINES[used.get(colour, 0) % len(LINES)]
+        used[colour] = used.get(colour, 0) + 1
+        found[method] = {"color": colour, "ls": line, "marker": marker, "ms": 5}
+    return found
 
 
 def _levels(axes: Axes, outcome: Outcome, along: str = "y") -> None:
@@ -42,13 +55,13 @@ def sample_efficiency(outcome: Outcome, path: Path) -> Path:
     """Interquartile mean error against simulator calls, with its interval."""
     with _style():
         figure, axes = plt.subplots(figsize=(9, 4.6), layout="constrained")
-        for k, method in enumerate(outcome.methods):
+        for method, look in looks(outcome.methods).items():
             budgets = outcome.budgets(method)
             found = [outcome.summary(method, b) for b in budgets]
-            axes.plot(budgets, [outcome.factor * s.mean for s in found], label=label(method), ms=5, **_look(k))  # type: ignore[arg-type]
+            axes.plot(budgets, [outcome.factor * s.mean for s in found], label=label(method), **look)
             if found[0].seeds > 1:
                 low, high = [outcome.factor * s.low for s in found], [outcome.factor * s.high for s in found]
-                axes.fill_between(budgets, low, high, color=COLOURS[k % len(COLOURS)], alpha=0.15, lw=0)
+                axes.fill_between(budgets, low, high, color=look["color"], alpha=0.15, lw=0)
         _levels(axes, outcome)
         axes.set(xscale="log", yscale="log", xlabel="simulator calls learnt from", ylabel=f"landing error, IQM [{outcome.shown}]")
         axes.yaxis.set_major_formatter("{x:g}")
@@ -61,10 +74,10 @@ def profiles(outcome: Outcome, budget: int, path: Path) -> Path:
     radii = np.geomspace(6e-4, 2, 200) * float((outcome.reaches / outcome.unit).max())
     with _style():
         figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
-        for method in (m for m in outcome.methods if budget in outcome.budgets(m)):
-            share = performance_profile(outcome.errors(method, budget), radii)
-            look = _look(outcome.methods.index(method)) | {"marker": None}
-            axes.plot(outcome.factor * radii, 100 * share, label=label(method), **look)  # type: ignore[arg-type]
+        for method, look in looks(outcome.methods).items():
+            if budget in outcome.budgets(method):
+                share = performance_profile(outcome.errors(method, budget), radii)
+                axes.plot(outcome.factor * radii, 100 * share, label=label(method), markevery=(0.02, 0.1), **look)
         _levels(axes, outcome, along="x")
         axes.set(
             xscale="log", xlabel=f"radius around the target [{outcome.shown}]", ylabel="answers within it [%]", ylim=(0, 101)
@@ -78,13 +91,15 @@ def pareto(outcome: Outcome, path: Path) -> Path:
     """Time spent learning against error, one point per method and budget; larger marks are larger budgets."""
     with _style():
         figure, axes = plt.subplots(figsize=(9, 4.6), layout="constrained")
-        for k, method in enumerate(outcome.methods):
+        for method, look in looks(outcome.methods).items():
             budgets = outcome.budgets(method)
             seconds = [max(outcome.learning_seconds(method, b), 1e-3) for b in budgets]
             errors = [outcome.factor * outcome.summary(method, b).mean for b in budgets]
-            axes.plot(seconds, errors, label=label(method), lw=0.8, ms=0, **(_look(k) | {"marker": None}))  # type: ignore[arg-type]
+            axes.plot(seconds, errors, label=label(method), lw=0.8, **look)
             sizes = [12 * np.log10(b) ** 1.5 for b in budgets]
-            axes.scatter(seconds, errors, s=sizes, color=COLOURS[k % len(COLOURS)], marker=MARKERS[k % len(MARKERS)])
+            axes.scatter(
+                seconds, errors, s=sizes, color=look["color"], marker=look["marker"], edgecolor="white", lw=0.5, zorder=3
+            )
         _levels(axes, outcome)
         axes.set(
             xscale="log",
