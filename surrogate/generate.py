@@ -58,7 +58,7 @@ class GenerateConfig:
     landing: str = "rest"
     """Where a landing is read: rest or touchdown."""
     duration: float | None = None
-    """Longest time that a hop is followed [s]; None: the scene's."""
+    """Longest time that a hop is followed [s]; None: the scene's, or what the least gravity of --ranges takes."""
     ranges: tuple[str, ...] = ()
     """Values of the scene that vary: gravity=1.6:9.8 friction=0.3:0.8 ..."""
     design: Design = field(default_factory=Design)
@@ -234,7 +234,9 @@ def configuration_of(config: GenerateConfig) -> tuple[Configuration, Floats | No
     default = {"grid": config.grid**lattice.n_cells, "file": 0 if stretches is None else len(stretches)}.get(sampler, 10_000)
     hops = default - (config.first if sampler in ("grid", "file") else 0) if config.hops is None else config.hops
     size = {"lhs": hops, "grid": config.grid, "file": default}.get(sampler, 0)
-    scene = Scene.preset(config.scene, **changes)
+    scene, ranges = Scene.preset(config.scene, **changes), dict(_range(text) for text in config.ranges)
+    if "gravity" in ranges and config.duration is None:
+        scene = scene.lasting(ranges["gravity"][0])  # one duration for all the file: long enough for the slowest hops
     configuration = Configuration(
         design=config.design,
         scene=scene,
@@ -245,7 +247,7 @@ def configuration_of(config: GenerateConfig) -> tuple[Configuration, Floats | No
         stretches_hash="" if stretches is None else stretches_hash(stretches),
         dt=config.dt,
         fidelity=_fidelity(config, scene, lattice),
-        scene_ranges=dict(_range(text) for text in config.ranges),
+        scene_ranges=ranges,
         symmetry=config.symmetry,
         node_positions=config.node_positions,
         trajectory=config.trajectory,

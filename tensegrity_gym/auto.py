@@ -7,6 +7,7 @@ from functools import lru_cache
 
 from tensegrity_gym.calibration import LADDER, Calibration, calibrate, sample_stretches, stored_calibration
 from tensegrity_gym.design import Design
+from tensegrity_gym.errors import InvalidParameterError
 from tensegrity_gym.fidelity import FIDELITIES, Fidelity
 from tensegrity_gym.formfinding import form_find
 from tensegrity_gym.hops import positive
@@ -52,9 +53,9 @@ def preset_of(scene: Scene) -> str | None:
 @lru_cache(maxsize=16)
 def pilot(design: Design, scene: Scene, lattice: Lattice) -> Calibration:
     """A small calibration of the scene at hand; bars that no equilibrium loads to buckling may be modelled by one spring."""
-    models = LADDER[scene.landing]
+    models = tuple(model for model in LADDER[scene.landing] if _suits(model, design))
     found = form_find(sample_stretches(PILOT_SAMPLES, 1, lattice.n_cells), design=design, scene=scene, lattice=lattice)
-    if (found.bar_load < 0.9 * design.critical_load).all():
+    if models and (found.bar_load < 0.9 * design.critical_load).all():
         models = (replace(models[0], bar_segments=1, bar_softening=1.0), *models)
     return calibrate(
         scene,
@@ -66,6 +67,15 @@ def pilot(design: Design, scene: Scene, lattice: Lattice) -> Calibration:
         reference=PILOT_REFERENCE,
         threads=None,
     )[scene.landing]
+
+
+def _suits(model: Fidelity, design: Design) -> bool:
+    """Whether a model can have bars of that design: those that are softened must still bear their prestress."""
+    try:
+        model.design(design)
+    except InvalidParameterError:
+        return False
+    return True
 
 
 def _length(metres: float) -> str:

@@ -9,12 +9,19 @@ from itertools import pairwise
 
 import numpy as np
 
+from tensegrity_gym.errors import InvalidParameterError
+
 Progress = Callable[[int], object]
 
 
 def thread_count(threads: int | None) -> int:
-    """``threads``, or as many as this process may use."""
-    return max(1, int(threads)) if threads is not None else max(1, len(os.sched_getaffinity(0)))
+    """``threads``, or as many as this process may use; InvalidParameterError for what is no integer."""
+    if threads is None:
+        # only Linux tells which cores a process may use
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)):
+        raise InvalidParameterError(f"threads: expected an integer or None, got {threads!r}")
+    return max(1, int(threads))
 
 
 def shares(n: int, parts: int, lanes: int) -> list[tuple[int, int]]:

@@ -160,6 +160,11 @@ def calibrate(
         if progress:
             progress(1)
     usable = ~exact.failed & ~paper.failed & ~np.any([m.failed for m in moved], axis=0)
+    if not usable.any():
+        why = next(iter(paper.describe_failures()), "they fail when moved a little")
+        raise InvalidParameterError(
+            f"fidelity 'auto': expected hops to measure models on, but none of {samples} has a landing ({why}); name a fidelity"
+        )
     found = {}
     for landing, models in ladder.items():
         largest = np.max([shift(m, paper, landing) for m in moved], axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -105,8 +106,9 @@ def reach(scene: str = "earth", hops: int = 256, seed: int = 0, save: bool = Fal
         save: replace the reach that the package stores for this preset, which targets and rewards follow.
     """
     calibration.check_sample(hops, seed)  # before a progress bar is drawn
+    where = Scene.preset(scene)
     with tqdm(total=hops, desc=f"hops, {scene}", unit="hop") as bar:
-        measured = reachable.measure_reach(Scene.preset(scene), hops, seed, bar.update)
+        measured = reachable.measure_reach(where, hops, seed, bar.update)
     for landing, found in measured.items():
         stored = reachable.stored_reach(scene, landing)
         print(
@@ -127,9 +129,10 @@ def calibrate(scene: str = "earth", samples: int = 64, seed: int = 1, save: bool
         save: replace the calibration that the package stores for this preset, which `fidelity="auto"` chooses by.
     """
     calibration.check_sample(samples, seed)
+    where = Scene.preset(scene)
     batches = 2 + calibration.UNKNOWNS + sum(len(models) for models in calibration.LADDER.values())
     with tqdm(total=batches, desc=f"models, {scene}", unit="batch") as bar:
-        measured = calibration.calibrate(Scene.preset(scene), samples, seed, progress=bar.update)
+        measured = calibration.calibrate(where, samples, seed, progress=bar.update)
     for landing, found in measured.items():
         print(f"{scene}, {landing}: floor {1e3 * found.floor:.3g} mm")
         print("  cost   median [mm]  97 % [mm]  model")
@@ -166,11 +169,16 @@ def summary(result: HopResult, scene: Scene) -> str:
 
 
 def check_writable(path: Path | None) -> None:
-    """OutputFolderError if ``path`` lies in a folder that is not there: better before a simulation than after it."""
-    if path is not None and not path.resolve().parent.is_dir():
-        raise OutputFolderError(
-            f"expected an existing folder to write {path.name} to, got {path.resolve().parent}; make it first"
-        )
+    """OutputFolderError for a ``path`` that no file can be written to: better before a simulation than after it."""
+    if path is None:
+        return
+    folder = path.resolve().parent
+    if not folder.is_dir():
+        raise OutputFolderError(f"expected an existing folder to write {path.name} to, got {folder}; make it first")
+    if path.is_dir():
+        raise OutputFolderError(f"expected a file's name to write to, got the folder {path}; add a name")
+    if not os.access(folder, os.W_OK):
+        raise OutputFolderError(f"expected a folder that may be written to, got {folder}; choose another")
 
 
 def main(args: list[str] | None = None) -> int:

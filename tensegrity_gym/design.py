@@ -7,7 +7,7 @@ method (Schek 1974) on one representative node.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -145,6 +145,10 @@ class Design:
                 f"{self.bar_rigidity:.4g} N and {self.prestress_load:.4g} N, which would press a bar of any length to nothing; "
                 "take a larger bar_modulus or bar_diameter, or less bar_softening or prestrain"
             )
+
+    def undamped(self) -> Design:
+        """The design without dampings: what its equilibria depend on."""
+        return replace(self, bar_damping=0.0, cable_damping=0.0, hinge_damping=0.0)
 
     @property
     def cell_height(self) -> float:

@@ -13,7 +13,7 @@ from tensegrity_gym.types import ENERGY_NAMES, Floats, HopStatus
 
 def flew(status: np.ndarray) -> np.ndarray:
     """Which hops took off."""
-    return np.isin(status, (HopStatus.RESTED, HopStatus.TIME_LIMIT, HopStatus.STOPPED))
+    return np.isin(status, (HopStatus.RESTED, HopStatus.TIME_LIMIT, HopStatus.STOPPED, HopStatus.IN_FLIGHT))
 
 
 def measure(records: rec.HopRecords, problem: Problem, lattice: Lattice) -> dict[str, np.ndarray]:

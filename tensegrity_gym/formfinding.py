@@ -23,7 +23,7 @@ from tensegrity_gym.searches import (
     imperfection_forces,
     start_positions,
 )
-from tensegrity_gym.types import Floats, Structure, is_number
+from tensegrity_gym.types import Floats, Structure, is_number, or_default
 
 __all__ = [
     "METHODS",
@@ -65,6 +65,9 @@ class Equilibria:
     evaluations: np.ndarray  #: of the energy or of the forces, on all load paths tried, shape (n,)
     tolerance: float  #: residual asked for [N]
     max_iterations: int  #: cap of the method
+    design: Design  #: what the lattice was built to
+    lattice: Lattice  #: its topology
+    gravity: float  #: along the ground's normal [m/s^2]
 
     @property
     def stored_energy(self) -> Floats:
@@ -104,7 +107,10 @@ def as_stretches(stretches: ArrayLike, lattice: Lattice, low: float = STRETCH_RA
     Raises InvalidStretchesError, which names the first bad row.
     """
     try:
-        values = np.array(stretches, dtype=np.float64, order="C")
+        given = np.asarray(stretches)
+        if given.dtype.kind == "c":
+            raise TypeError("complex")  # numpy would drop the imaginary part
+        values = np.array(given, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise InvalidStretchesError(f"stretches: expected numbers, got {stretches!r}") from error
     n = lattice.n_cells
@@ -148,7 +154,8 @@ def form_find(
     Raises InvalidStretchesError and InvalidParameterError. What did not converge says so in ``converged``, and why in
     ``hints``; never use it.
     """
-    design, scene, lattice = design or Design(), Scene.of(scene, "form_find"), lattice or Lattice()
+    design, scene = or_default(design, Design, "form_find"), Scene.of(scene, "form_find")
+    lattice = or_default(lattice, Lattice, "form_find")
     values = as_stretches(stretches, lattice, *(WIDEST_RANGE if outside else STRETCH_RANGE))
     if method not in METHODS:
         raise InvalidParameterError(f"form_find: expected method in {METHODS}, got {method!r}")
@@ -157,11 +164,14 @@ def form_find(
     problem = Problem(values, begin, design, scene, lattice, structure)
     found = SEARCHES[method](problem, _as_options(options), threads, progress)
     positions = _canonical_pose(_canonical_bows(found.positions, lattice, design), reference, structure)
-    return _report(values, positions, found, scene, structure, method)
+    return _report(values, positions, found, problem, method)
 
 
 def _as_start(start: Floats, n: int, n_masses: int) -> Floats:
-    positions = np.asarray(start, dtype=np.float64)
+    try:
+        positions = np.asarray(start, dtype=np.float64)
+    except (TypeError, ValueError):
+        positions = np.full(1, np.nan)
     positions = positions[None] if positions.ndim == 2 else positions
     if positions.shape != (n, n_masses, 3) or not np.isfinite(positions).all():
         raise InvalidParameterError(
@@ -171,7 +181,7 @@ def _as_start(start: Floats, n: int, n_masses: int) -> Floats:
 
 
 def _as_options(options: SearchOptions | None) -> SearchOptions:
-    options = options or SearchOptions()
+    options = or_default(options, SearchOptions, "form_find")
     for name in ("tolerance", "max_iterations", "load_step", "line_tolerance", "line_cap"):
         value = getattr(options, name)
         if value is not None and not (is_number(value) and value > 0):
@@ -224,7 +234,8 @@ def _canonical_pose(positions: Floats, reference: Floats, structure: Structure) 
     return turned
 
 
-def _report(values: Floats, positions: Floats, found: Found, scene: Scene, structure: Structure, method: str) -> Equilibria:
+def _report(values: Floats, positions: Floats, found: Found, problem: Problem, method: str) -> Equilibria:
+    design, scene, lattice, structure = problem.design, problem.scene, problem.lattice, problem.structure
     lengths = values * structure.actuator_length
     flat = replace(scene, slope=0.0, gravity=scene.gravity * np.cos(scene.slope))
     energies = elastic_energies(structure, positions, lengths)
@@ -247,4 +258,7 @@ def _report(values: Floats, positions: Floats, found: Found, scene: Scene, struc
         evaluations=found.evaluations,
         tolerance=found.tolerance,
         max_iterations=found.max_iterations,
+        design=design,
+        lattice=lattice,
+        gravity=-float(scene.gravity_vector[2]),
     )

@@ -179,23 +179,31 @@ def hop(
     )
 
 
-def time_step(dt: float | None, design: Design, lattice: Lattice, fidelity: Fidelity, allow_unstable: bool) -> float:
+def time_step(
+    dt: float | None,
+    design: Design,
+    lattice: Lattice,
+    fidelity: Fidelity,
+    allow_unstable: bool = False,
+    caller: str = "simulate",
+) -> float:
     """``dt`` if it is stable, or the fidelity's step [s]; ``design`` is as the fidelity models it.
 
     Raises InvalidParameterError for an unstable step unless ``allow_unstable``.
     """
-    step = default_time_step(design, lattice, fidelity.step) if dt is None else positive("dt", dt)
+    step = default_time_step(design, lattice, fidelity.step) if dt is None else positive("dt", dt, caller)
     critical = POSTURES * STABLE_STEPS[fidelity.integrator] * default_time_step(design, lattice) / MARGIN
     if step > critical and not allow_unstable:
+        study = " or, to study the instability, allow_unstable=True" if caller == "simulate" else ""
         raise InvalidParameterError(
-            f"simulate: dt = {step:.4g} s is above the critical step of {fidelity.integrator}, {critical:.4g} s; "
-            f"use dt <= {MARGIN * critical:.4g} or, to study the instability, allow_unstable=True"
+            f"{caller}: dt = {step:.4g} s is above the critical step of {fidelity.integrator}, {critical:.4g} s; "
+            f"use dt <= {MARGIN * critical:.4g}{study}"
         )
     return step
 
 
-def positive(name: str, value: float) -> float:
+def positive(name: str, value: float, caller: str = "simulate") -> float:
     """``value`` as a float; InvalidParameterError if it is no finite number > 0."""
     if not is_number(value) or value <= 0:
-        raise InvalidParameterError(f"simulate: expected {name} to be a finite number > 0, got {value!r}")
+        raise InvalidParameterError(f"{caller}: expected {name} to be a finite number > 0, got {value!r}")
     return float(value)

@@ -115,7 +115,8 @@ def measure_reach(scene: Scene, hops: int = 256, seed: int = 0, progress: Progre
 
 def _landings(result: HopResult, landing: str) -> Floats:
     """Landings of the hops that have one, shape (n, 2) [m]."""
-    bad = result.failed | ((result.status == HopStatus.NO_FLIGHT) if landing == "touchdown" else False)
+    never_down = np.isin(result.status, (HopStatus.NO_FLIGHT, HopStatus.IN_FLIGHT))
+    bad = result.failed | (never_down if landing == "touchdown" else False)
     if bad.all():
         raise InvalidParameterError(f"measure_reach: expected a hop with a landing, got none out of {len(bad)}")
     return getattr(result, landing)[~bad]

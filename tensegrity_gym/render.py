@@ -23,10 +23,12 @@ from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.simulate import simulate
-from tensegrity_gym.types import Floats, Structure
+from tensegrity_gym.types import Floats, Structure, is_number, or_default
 
 #: Size of a frame of a film, by default [pixels].
 FRAME_SIZE = (640, 480)
+#: Most frames a second of a .gif: what lasts less than two ticks of its clock viewers show for longer.
+FASTEST_GIF = 50
 #: A lattice whose lowest mass is above this is off the ground [m].
 ALOFT = 1e-3
 
@@ -164,14 +166,23 @@ def record_hop(
 ) -> Path:
     """Simulate one hop and write it as ``.gif`` or ``.mp4`` (which needs the extra "video"); returns the path.
 
-    ``fidelity`` is as for ``simulate``. ``speed`` is real time over film time [-]: 0.5 is slow motion. ``target`` [m] is
-    relative to the start. The camera holds the whole hop in view.
+    ``fidelity`` is as for ``simulate``. ``speed`` is real time over film time [-]: 0.5 is slow motion; it is kept whatever whole
+    steps and a format's clock make of ``fps``, at most 50 of a .gif. ``target`` [m] is relative to the start. The camera holds
+    the whole hop in view.
     """
     path = Path(path)
     check_film(path, "record_hop")
-    if not fps > 0 or not speed > 0:
-        raise InvalidParameterError(f"record_hop: expected fps > 0 and speed > 0, got {fps!r} and {speed!r}")
-    scene, design, lattice = scene or Scene(), design or Design(), lattice or Lattice(2, 2)
+    for name, value in (("fps", fps), ("speed", speed)):
+        if not is_number(value) or value <= 0:
+            raise InvalidParameterError(f"record_hop: expected {name} to be a finite number > 0, got {value!r}")
+    if path.suffix.lower() == ".gif" and fps > FASTEST_GIF:
+        raise InvalidParameterError(
+            f"record_hop: expected at most {FASTEST_GIF} fps of a .gif, which viewers play no faster, got {fps!r}; write an .mp4"
+        )
+    if target is not None and (np.shape(target) != (2,) or not np.isfinite(np.asarray(target, dtype=float)).all()):
+        raise InvalidParameterError(f"record_hop: expected target to be two finite numbers (x, y) [m], got {target!r}")
+    scene, design = Scene.of(scene, "record_hop"), or_default(design, Design, "record_hop")
+    lattice = or_default(lattice, Lattice, "record_hop")
     one = np.atleast_2d(np.asarray(stretches, dtype=float))[:1]
     hop = simulate(one, scene=scene, design=design, lattice=lattice, fidelity=fidelity, trajectory_rate=fps / speed)
     design = hop.fidelity.design(design)  # what was simulated may have fewer masses
@@ -180,7 +191,7 @@ def record_hop(
         start = trajectory.positions[0, :1]
         target = np.asarray(target, dtype=float) + _centre_of_mass(start, _structure(lattice, design))[0, :2]
     pictures = hop_frames(trajectory, lattice=lattice, design=design, size=size, target=target)
-    _write_video(pictures, path, fps)
+    _write_video(pictures, path, trajectory.times[0] / speed)
     return path
 
 
@@ -305,17 +316,22 @@ def _held_lengths(positions: Floats, structure: Structure) -> Floats:
     return 0.99 * np.linalg.norm(positions[upper] - positions[lower], axis=1)
 
 
-def _write_video(pictures: list[np.ndarray], path: Path, fps: int) -> None:
+def _write_video(pictures: list[np.ndarray], path: Path, times: Floats) -> None:
+    """Pictures that begin at ``times`` [s] of the film, evenly but for the first."""
+    interval = float(times[-1] - times[1]) / (len(times) - 2) if len(times) > 2 else 1.0
     if path.suffix.lower() == ".gif":
+        # whose clock ticks in hundredths of a second: rounded where each picture begins, so that no error adds up
+        ticks = np.round(100 * np.append(times, times[-1] + interval)).astype(int)
+        durations = [10 * int(tick) for tick in np.diff(ticks)]
         # one palette for all frames: the colours are few and must not flicker
         first = Image.fromarray(np.concatenate([pictures[len(pictures) // 2], colour_chart(pictures[0].shape[1])])).quantize(256)
         frames = [Image.fromarray(p).quantize(palette=first, dither=Image.Dither.NONE) for p in pictures]
-        frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False)
+        frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=False)
         return
     import imageio_ffmpeg
 
     height, width = pictures[0].shape[:2]
-    writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=fps, macro_block_size=2, quality=8)
+    writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=1 / interval, macro_block_size=2, quality=8)
     writer.send(None)
     for picture in pictures:
         writer.send(np.ascontiguousarray(picture))

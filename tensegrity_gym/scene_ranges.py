@@ -24,6 +24,8 @@ class SceneRanges:
     base: Scene = field(default_factory=Scene)
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Range (low, high) of each randomised value; keys out of ``SCENE_VALUES``, units as theirs."""
+    lasting: bool = False
+    """Whether scenes of weaker gravity than the base's are followed for longer (``Scene.lasting``), so that hops come down."""
 
     def __post_init__(self) -> None:
         for name, bounds in self.ranges.items():
@@ -60,13 +62,17 @@ class SceneRanges:
         unknown = [k for k in values if k not in known]
         if unknown:
             raise InvalidParameterError(f"scene: expected keys out of {sorted(known)}, got {unknown}")
-        return replace(scene, **values)
+        found = replace(scene, **values)
+        if self.lasting and "gravity" in values and "duration" not in values:
+            found = replace(found, duration=self.base.duration).lasting()
+        return found
 
 
 def scene_ranges(scene: str | Scene | SceneRanges | Mapping[str, Any], landing: str | None = None) -> SceneRanges:
     """What an env's ``scene=`` means: a preset's name, a Scene, or ranges such as ``{"gravity": (1.6, 9.8)}``.
 
-    In a mapping, ``"preset"`` names the base scene (default "earth"), a pair is a range and a number fixes a value.
+    In a mapping, ``"preset"`` names the base scene (default "earth"), a pair is a range and a number fixes a value; where it has
+    no ``"duration"``, hops under weaker gravity than the preset's are followed longer (``Scene.lasting``).
     ``landing`` ("rest" or "touchdown"), where given, replaces where the landing is read.
     """
     if isinstance(scene, SceneRanges):
@@ -75,15 +81,27 @@ def scene_ranges(scene: str | Scene | SceneRanges | Mapping[str, Any], landing: 
         found = SceneRanges(scene)
     elif isinstance(scene, str):
         found = SceneRanges(Scene.preset(scene))
+    elif isinstance(scene, Mapping) and "base" in scene:  # ranges, as a spec of an env that was read from JSON has them
+        found = _read_back(scene)
     elif isinstance(scene, Mapping):
         values = dict(scene)
         ranges = {k: tuple(v) for k, v in values.items() if k != "preset" and isinstance(v, (tuple, list))}
         fixed = {k: v for k, v in values.items() if k != "preset" and k not in ranges}
-        base = SceneRanges().changed(Scene.preset(values.get("preset", "earth")), fixed)
-        found = SceneRanges(base, ranges)  # type: ignore[arg-type]
+        lasting = "duration" not in fixed
+        base = SceneRanges(preset := Scene.preset(values.get("preset", "earth")), lasting=lasting).changed(preset, fixed)
+        found = SceneRanges(base, ranges, lasting)  # type: ignore[arg-type]
     else:
         raise InvalidParameterError(f"scene: expected a preset's name, a Scene or a mapping of ranges, got {scene!r}")
-    return found if landing is None else SceneRanges(replace(found.base, landing=landing), found.ranges)
+    return found if landing is None else replace(found, base=replace(found.base, landing=landing))
+
+
+def _read_back(plain: Mapping[str, Any]) -> SceneRanges:
+    known = {f.name for f in fields(SceneRanges)}
+    if not set(plain) <= known or not isinstance(plain["base"], Mapping) or not isinstance(plain.get("ranges", {}), Mapping):
+        raise InvalidParameterError(f"scene: expected the fields {sorted(known)} of SceneRanges, got {dict(plain)}")
+    ranges = {name: tuple(bounds) for name, bounds in plain.get("ranges", {}).items()}
+    base = SceneRanges().changed(Scene(), plain["base"])
+    return SceneRanges(base, ranges, bool(plain.get("lasting", False)))  # type: ignore[arg-type]
 
 
 def _check_range(name: str, bounds: Any) -> None:

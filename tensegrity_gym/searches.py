@@ -37,7 +37,8 @@ class SearchOptions:
 
     tolerance: float | None = None
     """Residual force per mass at which an equilibrium counts as found, over a bar's Euler load [-]: 1e-8 for Newton, whose
-    last step is quadratic; 2e-6 for relaxation; 1e-5 for conjugate gradients, whose energies cannot tell more."""
+    last step is quadratic, and at least what rounding leaves; 2e-6 for relaxation; 1e-5 for conjugate gradients, whose energies
+    cannot tell more."""
     max_iterations: int | None = None
     """Factorisations (2000, on each load path tried), directions (200 000) or steps (2 000 000) that one lattice may take."""
     load_step: float = 0.1
@@ -48,6 +49,11 @@ class SearchOptions:
     """Conjugate gradients: parabolas per line search."""
     damping: str = "viscous"
     """Relaxation: "viscous" or "kinetic"."""
+
+
+def _rounding(design: Design) -> float:
+    """Force [N] that members' lengths, which float64 rounds, leave unbalanced however long one searches."""
+    return 16 * float(np.finfo(np.float64).eps) * max(design.bar_rigidity, design.cable_rigidity)
 
 
 class Built(NamedTuple):
@@ -170,7 +176,7 @@ def newton_settings(problem: Problem, options: SearchOptions) -> NewtonSettings:
     return NewtonSettings(
         load_step=options.load_step,
         path_tolerance=0.02 * design.critical_load,
-        tolerance=(options.tolerance or TOLERANCE) * design.critical_load,
+        tolerance=max((options.tolerance or TOLERANCE) * design.critical_load, _rounding(design)),
         max_iterations=options.max_iterations or 2000,
         longest_step=0.05 * design.cell_height,
         least_shift=1e-4 * design.critical_load / design.bar_length,

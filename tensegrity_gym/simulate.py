@@ -15,7 +15,7 @@ from tensegrity_gym.formfinding import Equilibria, form_find
 from tensegrity_gym.hops import HopResult, hop, positive, run, time_step
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.types import Floats, is_number
+from tensegrity_gym.types import Floats, is_number, or_default
 
 #: Height over the ground that a drop's masses start from at least: as good as none, and more than zero in float32 too [m].
 LEAST_HEIGHT = 1e-30
@@ -48,15 +48,20 @@ def simulate(
       Fidelity.
     * ``dt`` [s], ``integrator`` and ``precision`` override the fidelity's. A ``dt`` above the critical step is refused unless
       ``allow_unstable``.
-    * ``trajectory_rate`` [Hz] asks for frames; it changes nothing else.
-    * ``equilibria`` of the same stretches, scene and ``fidelity.design(design)`` save finding them again.
-    * ``progress`` is called with the number of hops newly ended.
+    * ``trajectory_rate`` [Hz] asks for frames; it changes nothing else. They are a whole number of 32 steps apart, one at least.
+    * ``equilibria`` of the same stretches, lattice, gravity along the ground's normal and ``fidelity.design(design)`` (dampings
+      apart, which do not count at rest) save finding them again.
+    * ``progress`` is called with the number of hops newly ended, or not begun for want of an equilibrium.
 
     A hop that fails says so in ``status`` (see ``describe_failures``); its neighbours go on.
 
     Raises InvalidStretchesError and InvalidParameterError.
     """
-    design, scene, lattice = design or Design(), Scene.of(scene, "simulate"), lattice or Lattice()
+    design, scene, lattice = (
+        or_default(design, Design, "simulate"),
+        Scene.of(scene, "simulate"),
+        or_default(lattice, Lattice, "simulate"),
+    )
     rate = 0.0 if trajectory_rate is None else positive("trajectory_rate", trajectory_rate)
     if fidelity == "auto":
         chosen = choose_fidelity(design, scene, lattice, tolerance)
@@ -70,7 +75,7 @@ def simulate(
         time_step(dt, modelled, lattice, chosen, allow_unstable)  # refused before the search, not after it
         equilibria = form_find(stretches, design=modelled, scene=scene, lattice=lattice, threads=threads)
     else:
-        _check_equilibria(equilibria, stretches, lattice.mass_count(int(modelled.bar_segments)))
+        _check_equilibria(equilibria, stretches, modelled, scene, lattice)
     return hop(
         equilibria,
         design=design,
@@ -85,13 +90,25 @@ def simulate(
     )
 
 
-def _check_equilibria(equilibria: Equilibria, stretches: ArrayLike, n_masses: int) -> None:
-    if np.shape(np.atleast_2d(stretches)) != equilibria.stretches.shape or not np.allclose(stretches, equilibria.stretches):
+def _check_equilibria(found: Equilibria, stretches: ArrayLike, design: Design, scene: Scene, lattice: Lattice) -> None:
+    if np.shape(np.atleast_2d(stretches)) != found.stretches.shape or not np.allclose(stretches, found.stretches):
         raise InvalidParameterError("simulate: expected the stretches that the equilibria were found for, got others")
-    if equilibria.positions.shape[1] != n_masses:
+    if found.lattice != lattice:
+        raise InvalidParameterError(f"simulate: expected equilibria of {lattice}, got some of {found.lattice}; find them anew")
+    if found.design.undamped() != design.undamped():
+        wanted, came = (f"{type(d).__name__} {vars(d)}" for d in (design, found.design))
+        if type(design) is type(found.design):
+            other = [name for name, value in vars(design.undamped()).items() if getattr(found.design.undamped(), name) != value]
+            wanted, came = (", ".join(f"{name} {getattr(d, name):g}" for name in other) for d in (design, found.design))
         raise InvalidParameterError(
-            f"simulate: expected equilibria of {n_masses} point masses, got {equilibria.positions.shape[1]}; find them with "
-            "form_find(..., design=fidelity.design(design)) and the same lattice"
+            f"simulate: expected equilibria of a design with {wanted}, got some with {came}; find them with "
+            "form_find(..., design=fidelity.design(design))"
+        )
+    gravity = -float(scene.gravity_vector[2])
+    if not np.isclose(found.gravity, gravity, rtol=1e-6, atol=0.0):
+        raise InvalidParameterError(
+            f"simulate: expected equilibria under {gravity:.7g} m/s^2 along the ground's normal, got some under "
+            f"{found.gravity:.7g}; find them with form_find(..., scene=scene)"
         )
 
 
@@ -122,7 +139,7 @@ def drop(
 
     Raises InvalidParameterError.
     """
-    design, scene, lattice = design or Design(), Scene.of(scene, "drop"), lattice or Lattice()
+    design, scene, lattice = or_default(design, Design, "drop"), Scene.of(scene, "drop"), or_default(lattice, Lattice, "drop")
     chosen = named_fidelity(fidelity, tuple(FIDELITIES))  # "auto" knows the errors of hops, not those of drops
     modelled = chosen.design(design)
     rows = [_as_rows(name, a) for name, a in (("velocity", velocity), ("attitude", attitude), ("spin", spin))]
@@ -134,7 +151,7 @@ def drop(
         raise InvalidParameterError(f"drop: expected height to be a finite number >= 0 [m], got {height!r}")
     wide = [np.broadcast_to(row, (n, row.shape[1])) for row in rows]
     starts = _falling(modelled, lattice, wide[0], wide[1], wide[2], height)
-    rate = 0.0 if trajectory_rate is None else positive("trajectory_rate", trajectory_rate)
+    rate = 0.0 if trajectory_rate is None else positive("trajectory_rate", trajectory_rate, "drop")
     return run(
         starts,
         np.ones(n, dtype=bool),
@@ -145,7 +162,7 @@ def drop(
         scene=scene,
         lattice=lattice,
         fidelity=chosen,
-        dt=time_step(dt, modelled, lattice, chosen, False),
+        dt=time_step(dt, modelled, lattice, chosen, caller="drop"),
         rate=rate,
         threads=threads,
     )

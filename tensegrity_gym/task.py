@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tensegrity_gym.batch import thread_count
+from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
 from tensegrity_gym.fidelity import NAMES, Fidelity, changed, named_fidelity
 from tensegrity_gym.formfinding import STRETCH_RANGE
-from tensegrity_gym.hops import HopResult, positive
+from tensegrity_gym.hops import HopResult, time_step
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.reachable import reach_of
 from tensegrity_gym.scene import Scene
@@ -262,13 +263,17 @@ def check_fidelity(fidelity: str | Fidelity | Mapping[str, Any]) -> dict[str, An
 
     A mapping names what differs from the paper's model.
     """
-    if isinstance(fidelity, Fidelity) or (isinstance(fidelity, str) and fidelity in NAMES):
+    if isinstance(fidelity, str) and fidelity in NAMES:
         return {"fidelity": fidelity}
-    if isinstance(fidelity, Mapping) and set(fidelity) <= set(LEVERS):
-        levers = dict(fidelity)
+    step = None
+    if isinstance(fidelity, Mapping) and set(fidelity) <= {*LEVERS, "reason"}:
+        levers = {name: value for name, value in fidelity.items() if name != "reason"}  # which a spec read from JSON carries
         step = levers.pop("dt", None)
-        made = changed(named_fidelity("paper"), levers)
-        return {"fidelity": made} | ({} if step is None else {"dt": positive("dt", step)})
+        fidelity = changed(named_fidelity("paper"), levers)
+    if isinstance(fidelity, Fidelity):
+        # what no hop could be simulated with is refused now, not at every step
+        time_step(step, fidelity.design(Design()), Lattice(), fidelity, caller="fidelity")
+        return {"fidelity": fidelity} | ({} if step is None else {"dt": float(step)})
     raise InvalidParameterError(f"fidelity: expected one of {NAMES}, a Fidelity or a mapping of {LEVERS}, got {fidelity!r}")
 
 

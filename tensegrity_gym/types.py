@@ -7,10 +7,14 @@ everything in them is a C-contiguous array of one floating dtype or of ``int64``
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tensegrity_gym.errors import InvalidParameterError
+
+T = TypeVar("T")
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -21,6 +25,16 @@ def is_number(value: object) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         return False
     return bool(np.isfinite(value))
+
+
+def or_default(value: T | None, kind: type[T], caller: str) -> T:
+    """``value``, or the default of its kind for None; InvalidParameterError, in the name of ``caller``, for another kind."""
+    if value is None:
+        return kind()
+    if not isinstance(value, kind):
+        name = kind.__name__
+        raise InvalidParameterError(f"{caller}: expected a {name} or None, got {value!r}; use {name}(...)")
+    return value
 
 
 class Structure(NamedTuple):
@@ -97,14 +111,15 @@ class BlockPattern(NamedTuple):
 
 
 class HopStatus(IntEnum):
-    """How one hop ended. RESTED, TIME_LIMIT and STOPPED are flights; the rest still have finite landings."""
+    """How one hop ended. RESTED, TIME_LIMIT, STOPPED and IN_FLIGHT are flights; the rest still have finite landings."""
 
     RESTED = 0  #: flew, came down and came to rest
-    TIME_LIMIT = 1  #: flew, but was still moving, or flying, when ``scene.duration`` was over
+    TIME_LIMIT = 1  #: flew and came down, but was still moving when ``scene.duration`` was over
     NO_FLIGHT = 2  #: never left the ground with every mass
     UNSTABLE = 3  #: the integration blew up; its landing reads zero, which is no answer
     NOT_CONVERGED = 4  #: no equilibrium was found to start from; not simulated
     STOPPED = 5  #: flew and came down; by the fidelity's choice not followed to rest, which is not a number
+    IN_FLIGHT = 6  #: had not come down when ``scene.duration`` was over; touchdown and landing are where it was then
 
 
 #: Elastic energy is kept apart by member class; dissipated energies are cumulative. Order of ``energies`` columns.

@@ -59,6 +59,7 @@ class TensegrityHopVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         #: Hops simulated since the env was made.
         self.simulator_calls = 0
         self._rngs: list[np.random.Generator] = []
+        self._seeds: list[int] = []
         self._episodes: list[task.Episode] = []
 
     def reset(
@@ -68,16 +69,34 @@ class TensegrityHopVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         ``options``: as the single env's; "target" may also be one per env, shape (num_envs, 2) [m].
         """
-        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if _single(seed) else list(seed)  # type: ignore
-        seeds = [plain_seed(s) for s in seeds]
+        if _single(seed):
+            seeds = [None if seed is None else seed + i for i in range(self.num_envs)]  # type: ignore[operator]
+        elif isinstance(seed, Sequence | np.ndarray) and all(_single(s) for s in seed):
+            seeds = list(seed)
+        else:
+            raise InvalidParameterError(f"seed: expected an integer, a list of {self.num_envs} or None, got {seed!r}")
         if len(seeds) != self.num_envs:
             raise InvalidParameterError(f"seed: expected one, or {self.num_envs}, one per env, got {len(seeds)}")
-        if not self._rngs:
-            self._rngs = [seeding.np_random(s)[0] for s in seeds]
-        else:
-            self._rngs = [r if s is None else seeding.np_random(s)[0] for r, s in zip(self._rngs, seeds, strict=True)]
+        self._seed(seeds)
         self._episodes = self._draw(options)
         return self._observations(), self._gather([episode.info() for episode in self._episodes], {})
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """Seed of each env's generator, drawn at random where reset was given none, shape (num_envs,)."""
+        self._seed([None] * self.num_envs)
+        return tuple(self._seeds)
+
+    def _seed(self, seeds: Sequence[int | None]) -> None:
+        """Generators anew where a seed is given, or where there is none yet."""
+        first = not self._rngs
+        for i, seed in enumerate(seeds):
+            if first:
+                rng, kept = seeding.np_random(plain_seed(seed))
+                self._rngs.append(rng)
+                self._seeds.append(kept)
+            elif seed is not None:
+                self._rngs[i], self._seeds[i] = seeding.np_random(plain_seed(seed))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hop with stretches ``actions``, shape (num_envs, 4); every episode terminates and the next one begins."""

@@ -20,7 +20,7 @@ from tensegrity_gym import (
     form_find,
     simulate,
 )
-from tensegrity_gym.auto import choose_fidelity, pilot, preset_of
+from tensegrity_gym.auto import _suits, choose_fidelity, pilot, preset_of
 from tensegrity_gym.calibration import LADDER, Calibration, Rung, calibrate, save_calibration, stored_calibration
 from tensegrity_gym.fidelity import FIDELITIES
 from tensegrity_gym.specimen import Specimen
@@ -179,3 +179,13 @@ def test_a_specimen_scatters_by_what_it_says_and_keeps_loss_factors() -> None:
     again = Specimen.of(Design(), 3).structure(Lattice())
     np.testing.assert_array_equal(built.cable_stiffness, again.cable_stiffness)
     assert form_find(np.array([0.5]), design=Specimen.of(Design(), 3), lattice=Lattice(1, 1)).converged.all()
+
+
+def test_a_design_of_which_no_hop_lands_is_told_so() -> None:
+    """Under bars of 0.15 mm, which nothing holds up, no equilibrium is found to hop from."""
+    with pytest.raises(InvalidParameterError, match=r"none of 2 has a landing .*no equilibrium.*name a fidelity"):
+        calibrate(Scene(duration=0.05), 2, design=Design(bar_diameter=1.5e-4), ladder={"touchdown": ()}, unknowns=1)
+    soft = Design(bar_modulus=5e6)  # which the ladder's softened bars could not be made of
+    assert [model.bar_softening for model in LADDER["touchdown"] if _suits(model, soft)] == [1.0] * len(
+        [model for model in LADDER["touchdown"] if model.bar_softening == 1.0]
+    )

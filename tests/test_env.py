@@ -8,11 +8,12 @@ import warnings
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.save_video import save_video
 from scipy.stats import qmc
@@ -28,9 +29,9 @@ from tensegrity_gym.errors import (
     ResetNeededError,
     UnknownPresetError,
 )
-from tensegrity_gym.fidelity import Fidelity
+from tensegrity_gym.fidelity import Fidelity, named_fidelity
 from tensegrity_gym.reachable import LANDINGS, measure_reach, reach_of, save_reach, stored_reach
-from tensegrity_gym.scene_ranges import SCENE_VALUES
+from tensegrity_gym.scene_ranges import SCENE_VALUES, scene_ranges
 from tensegrity_gym.travel import TensegrityTravelEnv
 from tensegrity_gym.video import RecordVideo
 
@@ -553,3 +554,32 @@ def test_options_that_mean_nothing_are_refused(options: dict[str, Any], said: st
 def test_arguments_that_mean_nothing_are_refused(arguments: dict[str, Any], error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         TensegrityHopEnv(**arguments)
+
+
+def test_unknown_planets_are_hopped_on_until_the_hop_comes_down() -> None:
+    """On the Moon a flight lasts twice the time that hops are followed on Earth."""
+    env = gym.make("TensegrityHop-v0", scene={"gravity": (1.6, 9.8)}, landing="touchdown", fidelity="flown")
+    env.reset(seed=0, options={"scene": {"gravity": 1.62}, "target": (0.5, 0.0)})
+    info = env.step(np.array([0.3, 0.5, 0.25, 0.5]))[4]
+    assert info["status"] == HopStatus.STOPPED
+    env.reset(seed=0, options={"scene": {"gravity": 1.62, "duration": 3.0}, "target": (0.5, 0.0)})
+    assert env.step(np.array([0.3, 0.5, 0.25, 0.5]))[4]["status"] == HopStatus.IN_FLIGHT
+
+
+@pytest.mark.parametrize("fidelity", [{"dt": 1e-3}, {"step": 1.5}, {"bar_segments": 64}, Fidelity(step=1.5)])
+def test_a_fidelity_that_no_hop_can_have_is_refused_when_the_env_is_made(fidelity: Any) -> None:
+    with pytest.raises(InvalidParameterError, match=r"^fidelity: dt|bar_segments"):
+        gym.make("TensegrityHop-v0", fidelity=fidelity)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("fidelity", Fidelity(stop="landing", reason="why")), ("scene", scene_ranges({"gravity": (3.7, 9.8), "preset": "mars"}))],
+)
+def test_an_env_can_be_made_from_what_its_spec_says_in_json(name: str, value: Any) -> None:
+    env = gym.make("TensegrityHop-v0", **{name: value})
+    assert env.spec is not None
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    ours, theirs = (cast(TensegrityHopEnv, e.unwrapped).task for e in (env, again))
+    assert ours.scenes == theirs.scenes
+    assert named_fidelity(ours.levers["fidelity"]).levers() == named_fidelity(theirs.levers["fidelity"]).levers()

@@ -193,6 +193,16 @@ def test_a_film_has_all_frames(suffix: str, tmp_path: Path) -> None:
         assert abs(frames - expected) <= 1
 
 
+@pytest.mark.parametrize(("fps", "speed"), [(30, 0.5), (50, 1.0), (24, 2.0)])
+def test_a_film_runs_at_the_speed_asked_for(fps: int, speed: float, tmp_path: Path) -> None:
+    """Whatever whole strides make of a frame's interval, and hundredths of a second of its delay."""
+    path = record_hop([0.4] * 4, tmp_path / "hop.gif", scene=Scene(duration=1.0), fps=fps, speed=speed, size=(32, 32))
+    with Image.open(path) as film:
+        seconds = sum(film.seek(k) or film.info["duration"] for k in range(film.n_frames)) / 1000
+    frame = 1.0 / fps + 0.01  # the last picture's, and a tick
+    assert 1.0 / speed - frame <= seconds <= 1.0 / speed + frame
+
+
 def test_a_film_is_of_the_model_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the command line too; rests differ by centimetres between precisions, and other bars have fewer masses."""
     filmed: list[Trajectory] = []
@@ -218,5 +228,9 @@ def test_what_cannot_be_drawn_is_refused_by_name(standing: np.ndarray, tmp_path:
         draw_posture(standing * np.nan)
     with pytest.raises(InvalidParameterError, match=r"expected a path that ends in \.gif or \.mp4"):
         record_hop([0.3] * 4, tmp_path / "hop.avi")
-    with pytest.raises(InvalidParameterError, match="expected fps > 0"):
+    with pytest.raises(InvalidParameterError, match="expected fps to be a finite number > 0"):
         record_hop([0.3] * 4, tmp_path / "hop.gif", fps=0)
+    with pytest.raises(InvalidParameterError, match=r"at most 50 fps of a \.gif"):
+        record_hop([0.3] * 4, tmp_path / "hop.gif", fps=60)
+    with pytest.raises(InvalidParameterError, match="target to be two finite numbers"):
+        record_hop([0.3] * 4, tmp_path / "hop.gif", target=(np.nan, 0.0))

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tensegrity_gym.errors import InvalidParameterError, TensegrityError, UnknownPresetError
-from tensegrity_gym.scene import Scene
+from tensegrity_gym.scene import Scene, usual_duration
+from tensegrity_gym.scene_ranges import scene_ranges
 
 
 @pytest.mark.parametrize("name", sorted(Scene.PRESETS))
@@ -72,3 +73,26 @@ def test_scenes_are_frozen_and_hashable() -> None:
     assert len({Scene(), Scene(), Scene.preset("earth")}) == 1
     with pytest.raises(dataclasses.FrozenInstanceError):
         Scene().gravity = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("name", sorted(Scene.PRESETS))
+def test_hops_are_followed_longer_where_gravity_is_weaker(name: str) -> None:
+    """Flights last as 1/g; what a gravity takes is close to what its preset was given by hand."""
+    preset = Scene.preset(name)
+    assert Scene(gravity=preset.gravity).duration == pytest.approx(preset.duration, rel=0.05)
+    assert Scene(gravity=preset.gravity, duration=0.2).duration == 0.2
+    assert Scene.preset(name, gravity=0.5).duration == usual_duration(0.5) > preset.duration
+    assert Scene.preset(name, gravity=0.5, duration=1.0).duration == 1.0
+    assert Scene.preset(name, gravity=50.0).duration == preset.duration
+
+
+def test_scenes_drawn_are_followed_long_enough_unless_a_duration_is_given() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [scene_ranges({"gravity": (1.6, 9.8)}).sample(rng) for _ in range(20)]
+    assert [scene.duration for scene in drawn] == [usual_duration(scene.gravity) for scene in drawn]
+    assert len({scene.duration for scene in drawn}) == 20
+    assert {scene_ranges({"gravity": (1.6, 9.8), "duration": 0.2}).sample(rng).duration for _ in range(5)} == {0.2}
+    assert scene_ranges({"gravity": 1.625}).base.duration == usual_duration(1.625)
+    assert scene_ranges({"preset": "moon", "gravity": (1.6, 9.8)}).sample(rng).duration == 12.0
+    heavy = scene_ranges({"gravity": (1.6, 9.8)}, landing="touchdown")
+    assert heavy.changed(heavy.changed(heavy.base, {"gravity": 1.6}), {"gravity": 9.8}).duration == usual_duration(9.8)

@@ -61,6 +61,8 @@ def test_info_prints_the_lattice_and_the_design(capsys: pytest.CaptureFixture[st
         (["hop", "--picture", "no/such/folder/hop.png"], "OutputFolderError: expected an existing folder"),
         (["hop", "--picture", "hop.pdf"], "InvalidParameterError: --picture: expected a path that ends in"),
         (["hop", "--video", "hop.avi"], "InvalidParameterError: --video: expected a path that ends in .gif or .mp4"),
+        (["reach", "--scene", "nowhere"], "UnknownPresetError: .*got 'nowhere'"),
+        (["calibrate", "--scene", "nowhere"], "UnknownPresetError: .*got 'nowhere'"),
         (["reach", "--seed", "-1"], "InvalidParameterError: .*expected an integer seed >= 0, got -1"),
         (["calibrate", "--seed", "-1"], "InvalidParameterError: .*expected an integer seed >= 0, got -1"),
         (["reach", "--hops", "0"], "InvalidParameterError: .*expected an integer >= 1 of hops .*got 0"),
@@ -104,3 +106,12 @@ def test_kernels_are_cached_among_temporary_files_where_there_is_no_home(monkeyp
     folder = Path(jit._cache_folder())
     assert folder.is_dir()
     assert tmp_path in folder.parents
+
+
+def test_pictures_are_not_written_over_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delattr("tensegrity_gym.cli.simulate")  # known without a simulation
+    (tmp_path / "hop.png").mkdir()
+    assert main(["hop", "--picture", str(tmp_path / "hop.png")]) == 2
+    assert re.match("OutputFolderError: expected a file's name to write to, got the folder", capsys.readouterr().err)

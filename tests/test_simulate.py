@@ -32,7 +32,7 @@ from tensegrity_gym import (
     form_find,
     simulate,
 )
-from tensegrity_gym.batch import dealt, shares
+from tensegrity_gym.batch import dealt, shares, thread_count
 from tensegrity_gym.energies import centre_of_mass
 from tensegrity_gym.types import Ground
 
@@ -423,3 +423,66 @@ def test_other_lattices_hop() -> None:
         assert r.status[0] <= HopStatus.TIME_LIMIT
         total = r.energies.sum(axis=2)
         assert (np.abs(total - total[:, :1]) < 1e-3 * r.stored_energy).all()
+
+
+@pytest.mark.parametrize("fidelity", ["paper", "flown"])
+def test_a_hop_that_has_not_come_down_says_so(fidelity: str) -> None:
+    """Its touchdown is where it was: an answer to no question about landings."""
+    r = simulate(STRETCHES[:2], scene=Scene(gravity=1.62, duration=0.3), fidelity=fidelity, threads=1)
+    assert r.status.tolist() == [HopStatus.IN_FLIGHT] * 2
+    assert not r.failed.any()
+    assert (r.takeoff_velocity[:, 2] > 0).all()
+    np.testing.assert_allclose(r.touchdown_time, 0.3, atol=1e-3)
+
+
+def test_equilibria_of_something_else_are_refused() -> None:
+    def refused(said: str, equilibria: Equilibria, **options: Any) -> None:
+        with pytest.raises(InvalidParameterError, match=said):
+            simulate(STRETCHES[:1], equilibria=equilibria, **options)
+
+    own = subset(equilibria(), [0])
+    refused(r"under 1\.625 m/s\^2 along the ground's normal, got some under 9\.80665", own, scene=Scene.preset("moon"))
+    refused("a design with prestrain 0.002, got some with prestrain 0.0005", own, design=Design(prestrain=2e-3))
+    refused(r"equilibria of Lattice\(nx=4, ny=1\), got some of Lattice\(nx=2, ny=2\)", own, lattice=Lattice(4, 1))
+    short = Scene(duration=0.01)
+    simulate(STRETCHES[:1], equilibria=own, design=Design(bar_damping=0.0), scene=short, threads=1)  # which rest does not know
+    steep = Scene(slope=0.1, gravity=G / np.cos(0.1), duration=0.01)
+    simulate(STRETCHES[:1], equilibria=own, scene=steep, threads=1)  # friction holds the rest
+
+
+def test_what_is_no_design_lattice_or_start_is_refused_by_name() -> None:
+    for call in (simulate, form_find):
+        for name, value in (("design", {"prestrain": 1e-3}), ("lattice", (2, 2))):
+            with pytest.raises(InvalidParameterError, match=rf"{call.__name__}: expected a {name.title()} or None, got"):
+                call(STRETCHES[0], **{name: value})  # type: ignore[arg-type]
+    with pytest.raises(InvalidParameterError, match="form_find: expected a SearchOptions or None, got"):
+        form_find(STRETCHES[0], options={"tolerance": 1e-6})  # type: ignore[arg-type]
+    with pytest.raises(InvalidParameterError, match="form_find: expected start of"):
+        form_find(STRETCHES[0], start="abc")  # type: ignore[arg-type]
+    with pytest.raises(InvalidStretchesError, match="expected numbers"):
+        form_find(STRETCHES[0] + 0.1j)
+    with pytest.raises(InvalidParameterError, match="threads: expected an integer or None, got 'x'"):
+        simulate(STRETCHES[0], threads="x")  # type: ignore[arg-type]
+
+
+def test_drops_are_not_told_of_options_that_they_have_not() -> None:
+    with pytest.raises(InvalidParameterError, match=r"^drop: dt = 0.001 s is above the critical step .* use dt <= [-\de.]+$"):
+        drop([0, 0, -5], dt=1e-3)
+    with pytest.raises(InvalidParameterError, match=r"^drop: expected trajectory_rate"):
+        drop([0, 0, -5], trajectory_rate=-1.0)
+
+
+@pytest.mark.parametrize("fidelity", [Fidelity(), Fidelity(flight="rigid")])
+def test_progress_counts_hops_that_never_begin_or_end_early(fidelity: Fidelity) -> None:
+    e = subset(equilibria(), [0, 1, 2])
+    lost = replace(e, converged=np.array([True, False, False]))
+    seen: list[int] = []
+    simulate(STRETCHES[:3], equilibria=lost, scene=Scene(duration=0.02), fidelity=fidelity, progress=seen.append, threads=1)
+    assert sum(seen) == 3
+
+
+def test_threads_are_counted_where_no_system_tells_which_cores_are_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("os.sched_getaffinity")  # as on macOS and Windows
+    monkeypatch.setattr("os.cpu_count", lambda: 6)
+    assert thread_count(None) == 6
+    assert thread_count(2) == 2

@@ -235,3 +235,18 @@ def test_sb3_learns_a_fixed_target_better_than_random(name: str, hops: int, envs
     assert learnt.mean() > random.mean() + 4 * random.std() / np.sqrt(envs)
     assert learnt.mean() > np.quantile(random, 0.75)
     assert env.simulator_calls == hops + 2 * envs
+
+
+def test_seeds_are_told_as_they_were_given() -> None:
+    envs = TensegrityHopVectorEnv(3, scene=Scene(duration=0.05))
+    envs.reset(seed=5)
+    assert envs.np_random_seed == (5, 6, 7)
+    envs.reset(seed=[9, None, np.int64(4)])
+    assert envs.np_random_seed == (9, 6, 4)
+    with pytest.raises(InvalidParameterError, match=r"seed: expected an integer, a list of 3 or None, got 1\.5"):
+        envs.reset(seed=1.5)  # type: ignore[arg-type]
+    fresh = TensegrityHopVectorEnv(2, scene=Scene(duration=0.05))
+    drawn = fresh.np_random_seed
+    first, _ = fresh.reset()
+    again, _ = TensegrityHopVectorEnv(2, scene=Scene(duration=0.05)).reset(seed=list(drawn))
+    np.testing.assert_array_equal(first, again)

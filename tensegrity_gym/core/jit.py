@@ -6,6 +6,7 @@ key the cache folder by a hash of the whole package ``core`` instead.
 
 from __future__ import annotations
 
+import getpass
 import hashlib
 import os
 import tempfile
@@ -31,7 +32,9 @@ def _cache_folder() -> str:
         probe.touch()
         probe.unlink()
     except (OSError, RuntimeError):  # nothing can be written there, or the user has no home at all
-        folder = Path(tempfile.gettempdir()) / f"tensegrity_gym-{os.getuid()}" / digest.hexdigest()[:16]
+        folder = (
+            Path(tempfile.gettempdir()) / f"tensegrity_gym-{getattr(os, 'getuid', getpass.getuser)()}" / digest.hexdigest()[:16]
+        )
         folder.mkdir(parents=True, exist_ok=True)
     return str(folder)
 
