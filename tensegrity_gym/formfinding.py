@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tensegrity_gym.batch import Progress
+from tensegrity_gym.checks import is_number, or_default
 from tensegrity_gym.design import Design
 from tensegrity_gym.energies import elastic_energies, member_forces
 from tensegrity_gym.errors import InvalidParameterError, InvalidStretchesError
@@ -23,7 +24,7 @@ from tensegrity_gym.searches import (
     imperfection_forces,
     start_positions,
 )
-from tensegrity_gym.types import Floats, Structure, is_number, or_default
+from tensegrity_gym.types import Floats, Structure
 
 __all__ = [
     "METHODS",

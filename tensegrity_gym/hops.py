@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tensegrity_gym.batch import Progress
+from tensegrity_gym.checks import is_number
 from tensegrity_gym.core import records as rec
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError
@@ -17,7 +18,7 @@ from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.rollouts import Problem, follow
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.timestep import MARGIN, default_time_step
-from tensegrity_gym.types import Floats, HopStatus, Structure, is_number
+from tensegrity_gym.types import Floats, HopStatus, Structure
 from tensegrity_gym.version import MODEL_VERSION
 
 #: The critical step in the stiffest posture of a hop or drop over that of the unloaded lattice (docs/accuracy.md).

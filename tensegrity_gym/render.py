@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from PIL import Image
 
 from tensegrity_gym.canvas import TRAIL, Camera, Canvas, colour_chart
+from tensegrity_gym.checks import is_number, or_default
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError, MissingExtraError
 from tensegrity_gym.fidelity import Fidelity
@@ -23,7 +24,7 @@ from tensegrity_gym.hops import HopResult, Trajectory
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
 from tensegrity_gym.simulate import simulate
-from tensegrity_gym.types import Floats, Structure, is_number, or_default
+from tensegrity_gym.types import Floats, Structure
 
 #: Size of a frame of a film, by default [pixels].
 FRAME_SIZE = (640, 480)

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from tensegrity_gym.auto import choose_fidelity
 from tensegrity_gym.batch import Progress
+from tensegrity_gym.checks import is_number, or_default
 from tensegrity_gym.core import records as rec
 from tensegrity_gym.design import Design
 from tensegrity_gym.errors import InvalidParameterError
@@ -15,7 +16,7 @@ from tensegrity_gym.formfinding import Equilibria, form_find
 from tensegrity_gym.hops import HopResult, hop, positive, run, time_step
 from tensegrity_gym.lattice import Lattice
 from tensegrity_gym.scene import Scene
-from tensegrity_gym.types import Floats, is_number, or_default
+from tensegrity_gym.types import Floats
 
 #: Height over the ground that a drop's masses start from at least: as good as none, and more than zero in float32 too [m].
 LEAST_HEIGHT = 1e-30

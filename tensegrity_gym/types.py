@@ -7,34 +7,13 @@ everything in them is a C-contiguous array of one floating dtype or of ``int64``
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tensegrity_gym.errors import InvalidParameterError
-
-T = TypeVar("T")
-
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
-
-
-def is_number(value: object) -> bool:
-    """Whether ``value`` is one finite real number: no bool, no text, no array."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        return False
-    return bool(np.isfinite(value))
-
-
-def or_default(value: T | None, kind: type[T], caller: str) -> T:
-    """``value``, or the default of its kind for None; InvalidParameterError, in the name of ``caller``, for another kind."""
-    if value is None:
-        return kind()
-    if not isinstance(value, kind):
-        name = kind.__name__
-        raise InvalidParameterError(f"{caller}: expected a {name} or None, got {value!r}; use {name}(...)")
-    return value
 
 
 class Structure(NamedTuple):
