@@ -59,3 +59,5 @@ def run_shares(
                 reported = done
     for job in jobs:
         job.result()
+    if progress and n > reported:  # kernels count what they end, not what was over before it began
+        progress(n - reported)

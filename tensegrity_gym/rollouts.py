@@ -132,37 +132,20 @@ def follow(
     ``phase`` is the kernel's STANDING or FLYING; hops that are not ``usable`` are not simulated; ``runaway`` is a kinetic
     energy that no sane hop reaches [J], shape (n,).
     """
-    fidelity, told = problem.fidelity, _Told(progress)
+    fidelity = problem.fidelity
     to_rest = fidelity.stop == "rest" or problem.scene.landing == "rest"
     last = rec.END if to_rest else rec.TOUCHDOWN
     records = _records(problem, starts, phase, usable, runaway)
     if fidelity.flight == "full":
-        _roll_out(problem, last, records, threads, told)
+        _roll_out(problem, last, records, threads, progress)
     else:
-        _roll_out(problem, rec.TAKEOFF, records, threads, None if to_rest else told)
+        _roll_out(problem, rec.TAKEOFF, records, threads, None if to_rest else progress)
         _fly(problem, records)
         if to_rest:
-            _go_on(problem, records, runaway, threads, told)
-    told.rest_of(len(starts))  # the kernel counts what it ended: no hops that never began, or that ended before a second pass
+            _go_on(problem, records, runaway, threads, progress)
     # the kernel does not tell hops that have come down from those that have not: neither goes on
     records.status[(records.status == HopStatus.TIME_LIMIT) & (records.phase == rec.FLYING)] = HopStatus.IN_FLIGHT
     return records
-
-
-class _Told:
-    """Counts what ``progress`` was told."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self.progress, self.hops = progress, 0
-
-    def __call__(self, hops: int) -> None:
-        self.hops += hops
-        if self.progress:
-            self.progress(hops)
-
-    def rest_of(self, hops: int) -> None:
-        if hops > self.hops:
-            self(hops - self.hops)
 
 
 def _records(problem: Problem, starts: Floats, phase: int, usable: np.ndarray, runaway: Floats) -> rec.HopRecords:

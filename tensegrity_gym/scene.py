@@ -15,11 +15,17 @@ LANDINGS = ("rest", "touchdown")
 EARTH_GRAVITY, EARTH_DURATION = 9.80665, 3.0
 #: By which power of gravity hops are followed longer where it is weaker: it puts the presets' durations within 5 %.
 SLOWNESS = 0.76
+#: Longest duration that a scene may have [s].
+LONGEST = 1e4
 
 
 def usual_duration(gravity: float) -> float:
-    """How long to follow hops under ``gravity`` [m/s^2], so that all come down: flights last as 1/g [s]."""
-    return EARTH_DURATION * max(1.0, (EARTH_GRAVITY / gravity) ** SLOWNESS)
+    """How long to follow hops under ``gravity`` [m/s^2], so that all come down: flights last as 1/g [s].
+
+    At most what a scene may have; for a gravity that no scene has, Earth's.
+    """
+    slower = (EARTH_GRAVITY / gravity) ** SLOWNESS if gravity > 0 else 1.0
+    return min(EARTH_DURATION * max(1.0, slower), LONGEST)
 
 
 @dataclass(frozen=True)
@@ -56,12 +62,12 @@ class Scene:
             "slope_direction": (-2 * np.pi, 2 * np.pi),
             "friction": (0.0, 1e3),
             "restitution": (0.0, 1.0),
-            "duration": (0.0, 1e4),
+            "duration": (0.0, LONGEST),
         }
         for name, (low, high) in bounds.items():
             value = getattr(self, name)
             if name == "duration" and value is None:
-                value = usual_duration(self.gravity) if self.gravity > 0 else EARTH_DURATION
+                value = usual_duration(self.gravity)
                 object.__setattr__(self, name, value)
             if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not low <= value <= high:
                 raise InvalidParameterError(f"Scene.{name}: expected a number in [{low:g}, {high:g}], got {value!r}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from surrogate.generate import GenerateConfig, configuration_of
 from tensegrity_gym.errors import InvalidParameterError, TensegrityError, UnknownPresetError
 from tensegrity_gym.scene import Scene, usual_duration
 from tensegrity_gym.scene_ranges import scene_ranges
@@ -96,3 +98,10 @@ def test_scenes_drawn_are_followed_long_enough_unless_a_duration_is_given() -> N
     assert scene_ranges({"preset": "moon", "gravity": (1.6, 9.8)}).sample(rng).duration == 12.0
     heavy = scene_ranges({"gravity": (1.6, 9.8)}, landing="touchdown")
     assert heavy.changed(heavy.changed(heavy.base, {"gravity": 1.6}), {"gravity": 9.8}).duration == usual_duration(9.8)
+
+
+def test_gravity_next_to_nothing_is_a_scene_and_none_is_not() -> None:
+    assert Scene(gravity=1e-6).duration == 1e4  # what a scene may have, at most
+    for text in ("gravity=0:9.8", "gravity=-1:9.8"):
+        with pytest.raises(InvalidParameterError, match=r"Scene\.gravity"):
+            configuration_of(GenerateConfig(Path("hops.h5"), ranges=(text,)))
